@@ -1,0 +1,1 @@
+"""Training: data sets, architectures, training loop, export (extra `learn`, needs torch)."""

@@ -1,0 +1,1 @@
+"""The published files, one module per format; no decision is taken here."""

@@ -1,0 +1,1 @@
+"""Simulated cities with exact truth: geometry, light, camera (numpy only)."""

@@ -1,0 +1,97 @@
+"""Off-nadir geometry: where a point stands, and where the image shows it.
+
+All in metres: x east, y north, z up. A direction (to the satellite or the sun) is given by its azimuth, clockwise from true
+north seen from the target, and its elevation above the horizon at the target. Its **lean** k = cot(elevation)·u, with u the
+unit vector of the azimuth in the grid's axes, is metres of displacement per metre of height.
+
+In a terrain-corrected image a point at P with height z is shown at P_img with
+    P = P_img + (z − T(P_img))·k,                                                   (PAPER, off-nadir geometry)
+T being the terrain on which the image was projected (the DTM, or one constant height Z0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+Surface = Callable[[np.ndarray], np.ndarray]  # (n, 2) map metres -> (n,) heights in metres
+
+
+class Plane(NamedTuple):
+    """z = a(x − x0) + b(y − y0) + c, metres."""
+
+    a: float
+    b: float
+    c: float
+    x0: float
+    y0: float
+
+    def at(self, x_y: np.ndarray) -> np.ndarray:
+        """Height at map positions (n, 2)."""
+        x_y = np.asarray(x_y, float)
+        return self.a * (x_y[..., 0] - self.x0) + self.b * (x_y[..., 1] - self.y0) + self.c
+
+
+def lean(azimuth: float, elevation: float, convergence: float = 0.0) -> tuple[float, float]:
+    """Lean vector (east, north) in metres per metre of height.
+
+    `azimuth` (deg) is clockwise from true north; `convergence` (deg) is the meridian convergence, the
+    angle from true to grid north (clockwise positive), subtracted so that the vector is in grid axes.
+    """
+    angle = np.radians(azimuth - convergence)
+    length = 1.0 / np.tan(np.radians(elevation))
+    return float(length * np.sin(angle)), float(length * np.cos(angle))
+
+
+def ground_position(
+    image: np.ndarray, height: np.ndarray, terrain: Surface, k: tuple[float, float], projected_on: Surface | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where points seen at `image` (n, 2 map metres) with `height` (n, m above the ground under them) really are.
+
+    Iterates P_{j+1} = P_img + (h + T(P_j) − T0(P_img))·k, T0 being the surface the image was projected on (the terrain
+    itself unless given); converges while |slope|·|k| < 1. Returns positions (n, 2) and absolute heights (n,).
+    """
+    image = np.asarray(image, float)
+    k = np.asarray(k, float)
+    base = (projected_on or terrain)(image)
+    position = image + np.asarray(height, float)[..., None] * k
+    for _ in range(60):
+        moved = image + (height + terrain(position) - base)[..., None] * k
+        done = np.abs(moved - position).max(initial=0.0) < 1e-6
+        position = moved
+        if done:
+            break
+    return position, terrain(position) + height
+
+
+def image_position(
+    ground: np.ndarray, z: np.ndarray, k: tuple[float, float], projected_on: Surface
+) -> np.ndarray:
+    """Where the image shows points standing at `ground` (n, 2) with absolute height `z` (n,): the inverse of the above."""
+    ground = np.asarray(ground, float)
+    k = np.asarray(k, float)
+    position = ground.copy()
+    for _ in range(60):
+        moved = ground - (z - projected_on(position))[..., None] * k
+        done = np.abs(moved - position).max(initial=0.0) < 1e-6
+        position = moved
+        if done:
+            break
+    return position
+
+
+def ray_meets_plane(
+    image: np.ndarray, plane: Plane, k: tuple[float, float], projected_on: Surface
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the view rays of pixels `image` (n, 2 map metres) meet a plane: positions (n, 2) and absolute heights (n,).
+
+    On the ray P = P_img + (z − T0)·k, so z·(1 − g·k) = plane(P_img) − T0·(g·k) with g = (a, b): closed form. A plane seen
+    edge-on (g·k → 1) has no meeting point; callers bound the slope.
+    """
+    image = np.asarray(image, float)
+    base = projected_on(image)
+    steepness = plane.a * k[0] + plane.b * k[1]
+    z = (plane.at(image) - base * steepness) / (1.0 - steepness)
+    return image + (z - base)[..., None] * np.asarray(k, float), z
