@@ -1,0 +1,196 @@
+"""Heads: a network's raw outputs decoded to detections, the same for every architecture.
+
+Sections become a label image (s, s), 0 none, 1…n, with a score each. Corners become a table: position (col, row) in px with
+sub-pixel part, height (mean and σ over the height bins, m), score. `dense` heads are named maps, `instances` are the boxes,
+labels, scores and masks of a Mask R-CNN (docs/architecture.md, Models).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+
+class Sections(NamedTuple):
+    """Label image (s, s) int32 with labels 1…n, and scores (n,) in 0–1."""
+
+    labels: np.ndarray
+    scores: np.ndarray
+
+
+class Corners(NamedTuple):
+    """Columns of equal length: col, row (px), height and sigma (m above ground), score (0–1)."""
+
+    col: np.ndarray
+    row: np.ndarray
+    height: np.ndarray
+    sigma: np.ndarray
+    score: np.ndarray
+
+
+def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Sections:
+    """Sections of one tile from the outputs of either head."""
+    if contract["head"] == "dense":
+        return dense_sections(outputs["roof"][0], outputs["edge"][0], outputs["distance"][0], contract["thresholds"])
+    return instance_sections(outputs, contract["tile"], contract["thresholds"])
+
+
+def decode_corners(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Corners:
+    """Corners of one tile from the outputs of either head."""
+    if contract["head"] == "dense":
+        return dense_corners(
+            outputs["corner"][0], outputs["offset"], outputs["height"], contract["heights"], contract["thresholds"]
+        )
+    return instance_corners(outputs, contract["heights"], contract["thresholds"])
+
+
+def dense_sections(roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, thresholds: dict[str, float]) -> Sections:
+    """Markers where the distance to the rim is large, flooded over the roof (watershed).
+
+    `roof`, `edge`, `distance` are (s, s) in 0–1. A roof area without a marker is one section of its own. Sections under
+    `min_area` px are given to the neighbour they touch most, or dropped when alone.
+    """
+    mask = roof > thresholds["roof"]
+    if not mask.any():
+        return Sections(np.zeros(roof.shape, np.int32), np.zeros(0, np.float32))
+    markers, n = ndimage.label(mask & (distance > thresholds["marker"]))
+    areas, n_areas = ndimage.label(mask)
+    # Areas without any marker are too thin to have one: the area itself is the marker.
+    marked = np.zeros(n_areas + 1, bool)
+    marked[areas[markers > 0]] = True
+    lonely = mask & ~marked[areas]
+    markers[lonely] = areas[lonely] + n
+    labels = flood(markers, mask, distance - edge)
+    labels = absorb_small(labels, int(thresholds["min_area"]))
+    return Sections(labels, mean_by_label(roof, labels))
+
+
+def flood(markers: np.ndarray, mask: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Watershed of `level` (high inside sections) from `markers` (s, s) int, inside `mask`."""
+    from skimage.segmentation import watershed
+
+    return watershed(-level, markers.astype(np.int32), mask=mask).astype(np.int32)
+
+
+def absorb_small(labels: np.ndarray, min_area: int) -> np.ndarray:
+    """Give sections under `min_area` px to the neighbour with the longest common rim (4-neighbours); drop lone ones.
+
+    Labels of the result are 1…n in order of first appearance.
+    """
+    labels = labels.copy()
+    area = np.bincount(labels.ravel())
+    small = [int(i) for i in np.flatnonzero((area > 0) & (area < min_area)) if i > 0]
+    for label in sorted(small, key=lambda i: (area[i], i)):
+        own = labels == label
+        rim = cv2.dilate(own.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))).astype(bool) & ~own
+        around = labels[rim]
+        around = around[around > 0]
+        labels[own] = np.bincount(around).argmax() if around.size else 0
+    return relabelled(labels)
+
+
+def relabelled(labels: np.ndarray) -> np.ndarray:
+    """The same sections with labels 1…n in order of first appearance, row by row."""
+    values, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    order = np.argsort(np.where(values == 0, -1, first), kind="stable")
+    new = np.empty(len(values), np.int32)
+    offset = 0 if values[order[0]] == 0 else 1
+    new[order] = np.arange(len(values)) + offset
+    return new[inverse].reshape(labels.shape)
+
+
+def mean_by_label(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Mean of `values` over each label 1…n."""
+    n = int(labels.max(initial=0))
+    total = np.bincount(labels.ravel(), values.ravel().astype(np.float64), n + 1)
+    count = np.bincount(labels.ravel(), minlength=n + 1)
+    return (total / np.maximum(count, 1))[1:].astype(np.float32)
+
+
+def instance_sections(outputs: dict[str, np.ndarray], size: int, thresholds: dict[str, float]) -> Sections:
+    """Paste Mask R-CNN's 28×28 masks, best score last on top; sections under `min_area` px are dropped or absorbed."""
+    labels = np.zeros((size, size), np.int32)
+    scores = outputs["scores"]
+    keep = np.flatnonzero(scores >= thresholds["score"])
+    order = keep[np.lexsort((keep, scores[keep]))]
+    for number, i in enumerate(order, start=1):
+        window, mask = pasted(outputs["boxes"][i], outputs["masks"][i], size)
+        labels[window][mask > thresholds.get("mask", 0.5)] = number
+    kept = scores[order]
+    final = absorb_small(labels, int(thresholds["min_area"]))
+    old = np.zeros(int(final.max(initial=0)), np.int64)
+    for new in range(1, len(old) + 1):
+        old[new - 1] = np.bincount(labels[(final == new) & (labels > 0)]).argmax()
+    return Sections(final, kept[old - 1].astype(np.float32) if len(old) else np.zeros(0, np.float32))
+
+
+def pasted(box: np.ndarray, mask: np.ndarray, size: int) -> tuple[tuple[slice, slice], np.ndarray]:
+    """A box's (x0, y0, x1, y1) window of the tile and the mask's probabilities there, bilinear."""
+    x0, y0 = np.floor(np.maximum(box[:2], 0)).astype(int)
+    x1, y1 = np.ceil(np.minimum(box[2:], size)).astype(int)
+    x1, y1 = max(x1, x0 + 1), max(y1, y0 + 1)
+    n = mask.shape[-1]
+    col = (np.arange(x0, x1) + 0.5 - box[0]) / max(box[2] - box[0], 1e-3) * n - 0.5
+    row = (np.arange(y0, y1) + 0.5 - box[1]) / max(box[3] - box[1], 1e-3) * n - 0.5
+    grid = np.meshgrid(row, col, indexing="ij")
+    return (slice(y0, y1), slice(x0, x1)), ndimage.map_coordinates(mask, grid, order=1, mode="constant")
+
+
+def height_moments(distribution: np.ndarray, heights: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and σ (m) of distributions (B, n) over the contract's bins; a bin's own width counts into σ."""
+    centres = np.asarray(heights["centres"], np.float64)
+    widths = np.diff(np.asarray(heights["edges"], np.float64))
+    p = distribution.astype(np.float64)
+    p = p / np.maximum(p.sum(0), 1e-9)
+    mean = (p * centres[:, None]).sum(0)
+    variance = (p * ((centres[:, None] - mean) ** 2 + (widths**2 / 12)[:, None])).sum(0)
+    return mean, np.sqrt(variance)
+
+
+def dense_corners(
+    corner: np.ndarray, offset: np.ndarray, height: np.ndarray, heights: dict[str, Any], thresholds: dict[str, float]
+) -> Corners:
+    """Peaks of the corner heatmap (5×5 maxima), moved by the offset map, with the height distribution read there.
+
+    `corner` (s, s), `offset` (2, s, s) px from the pixel's centre, `height` (B, s/k, s/k) for any stride k.
+    """
+    peak = (corner >= thresholds["corner"]) & (corner >= ndimage.maximum_filter(corner, size=5, mode="constant"))
+    row, col = np.nonzero(peak)
+    score = corner[row, col].astype(np.float64)
+    x = col + 0.5 + offset[0, row, col]
+    y = row + 0.5 + offset[1, row, col]
+    k = corner.shape[0] / height.shape[1]
+    at = [np.clip(y / k - 0.5, 0, height.shape[1] - 1), np.clip(x / k - 0.5, 0, height.shape[2] - 1)]
+    distribution = (
+        np.stack([ndimage.map_coordinates(plane, at, order=1) for plane in height]) if len(row) else height[:, :0, 0]
+    )
+    mean, sigma = height_moments(distribution, heights)
+    return Corners(x.astype(np.float64), y.astype(np.float64), mean, sigma, score)
+
+
+def instance_corners(outputs: dict[str, np.ndarray], heights: dict[str, Any], thresholds: dict[str, float]) -> Corners:
+    """Mask R-CNN's corner squares: the box's centre, the class as height bin (labels start at 1, 0 being background).
+
+    Boxes of several classes over one corner (centres within `corner_nms` px) are one corner whose height is the mean of
+    the classes weighted by score.
+    """
+    keep = outputs["scores"] >= thresholds["score"]
+    boxes, labels, scores = outputs["boxes"][keep], outputs["labels"][keep].astype(int), outputs["scores"][keep]
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    reach = thresholds.get("corner_nms", 4.0)
+    free = np.ones(len(scores), bool)
+    rows = []
+    for i in np.lexsort((np.arange(len(scores)), -scores)):
+        if not free[i]:
+            continue
+        same = free & (np.abs(centre - centre[i]).max(axis=1) <= reach)
+        free &= ~same
+        distribution = np.zeros((len(heights["centres"]), 1))
+        np.add.at(distribution[:, 0], labels[same] - 1, scores[same])
+        mean, sigma = height_moments(distribution, heights)
+        rows.append((*centre[i], mean[0], sigma[0], scores[i]))
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    return Corners(*table.T)
