@@ -10,10 +10,12 @@ import contextlib
 import json
 import os
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -43,7 +45,9 @@ def whole(path: str | Path) -> Iterator[Path]:
 def write_json(path: str | Path, content: Any) -> None:
     """Write JSON with two-space indent, keys in the order given."""
     with whole(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(
+            json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
+        )
 
 
 def read_json(path: str | Path) -> Any:
@@ -67,4 +71,19 @@ def read_table(path: str | Path, columns: list[str] | None = None) -> pa.Table:
     except (pa.ArrowInvalid, OSError) as error:
         if isinstance(error, FileNotFoundError):
             raise
+        raise DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error
+
+
+def write_arrays(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write named arrays as a compressed npz."""
+    with whole(path) as temporary, temporary.open("wb") as target:
+        np.savez_compressed(target, **arrays)
+
+
+def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
+    """Read named arrays; a damaged file raises `DamagedFile`."""
+    try:
+        with np.load(path, allow_pickle=False) as source:
+            return {name: source[name] for name in source.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error

@@ -1,0 +1,77 @@
+"""Corners: every roof corner of a block with its height above ground, by the 3D model on the blended tiles.
+
+A tile answers for the corners in its core; those up to `SEAM` px beyond are kept too, because two tiles may each place a
+corner on the seam just across it. `stitch` keeps one of the two.
+
+In: `blended.tif`, the model. Out: `corners.parquet`: tile, position (px, image coordinates), height and σ (m), score.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+import pyarrow as pa
+
+from kibs_steps import cli, raster, scene, sections, store
+from kibs_steps.grid import Tile, Tiling
+from kibs_steps.models import heads, runtime
+
+SEAM = 1.5  # px: further than the position error of one corner seen by two tiles
+
+CORNERS = pa.schema(
+    [
+        ("tile_row", pa.int64()),
+        ("tile_col", pa.int64()),
+        ("col", pa.float64()),
+        ("row", pa.float64()),
+        ("height", pa.float64()),
+        ("sigma", pa.float64()),
+        ("score", pa.float64()),
+        ("owner", pa.int64()),
+    ]
+)
+
+
+def of_tile(found: heads.Corners, tile: Tile, tiling: Tiling) -> pa.Table:
+    """A tile's corners in or just beyond its core, in image coordinates; `owner` 0: not filed yet."""
+    window = tiling.window(tile)
+    col, row = found.col + window.col, found.row + window.row
+    keep = np.flatnonzero(
+        (col >= tile.core.col - SEAM)
+        & (col < tile.core.col + tile.core.width + SEAM)
+        & (row >= tile.core.row - SEAM)
+        & (row < tile.core.row + tile.core.height + SEAM)
+    )
+    n = len(keep)
+    columns = [np.full(n, tile.row), np.full(n, tile.col), col[keep], row[keep]]
+    columns += [found.height[keep], found.sigma[keep], found.score[keep], np.zeros(n, np.int64)]
+    return pa.table(columns, schema=CORNERS)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Find the roof corners of one block and their heights."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.corners", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--blended", required=True, help="blended.tif of the block")
+    parser.add_argument("--model", required=True, help="models/corners.json")
+    parser.add_argument("--name", required=True, help="block name")
+    parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--out", required=True, help="corners.parquet")
+    args = parser.parse_args(argv)
+    facts = scene.read(args.scene)
+    model = runtime.from_record(args.model, "corners")
+    tiling = Tiling(model.contract["tile"], model.contract["margin"], args.block)
+    tiles = tiling.tiles(tiling.block_of(args.name), facts.grid.width, facts.grid.height)
+    images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
+    geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
+    network = runtime.open_network(model, geometry)
+    tables = [CORNERS.empty_table()]
+    for tile in tiles:
+        image = images[tile.row, tile.col]
+        tables.append(of_tile(heads.decode_corners(network(image), model.contract), tile, tiling))
+    store.write_table(args.out, pa.concat_tables(tables))
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,38 @@
+"""Intermediate rasters: tiled, quickly compressed GeoTIFFs of one block, read and written whole."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from affine import Affine
+from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
+
+from kibs_steps import store
+
+FORMAT = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate", "zlevel": 1}
+
+
+def write(path: str | Path, image: np.ndarray, crs: str | None = None, transform: Affine | None = None) -> None:
+    """Write an image (rows, cols) or (rows, cols, bands)."""
+    bands = image[None] if image.ndim == 2 else image.transpose(2, 0, 1)
+    shape = {"count": bands.shape[0], "height": bands.shape[1], "width": bands.shape[2]}
+    place = {"crs": crs, "transform": transform} if transform is not None else {}
+    with store.whole(path) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(temporary, "w", dtype=image.dtype, **shape, **FORMAT, **place) as target:
+            target.write(bands)
+
+
+def read(path: str | Path) -> np.ndarray:
+    """Read an image as (rows, cols) or (rows, cols, bands); a damaged file raises `store.DamagedFile`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as source:
+                bands = source.read()
+    except RasterioIOError as error:
+        raise store.DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error
+    return bands[0] if bands.shape[0] == 1 else bands.transpose(1, 2, 0)

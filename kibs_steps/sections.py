@@ -1,0 +1,266 @@
+"""Sections: every roof section of a block, by the 2D model, tile by tile, joined across the block's inner seams.
+
+A **piece** is what one tile sees of a section inside its own core. Neighbouring tiles see a common strip of 2 × margin px
+along their seam; two pieces are **linked**, i.e. are one section, when on that strip each is the other's best match. Links
+depend on two tiles alone, so neither the order of work nor the cut into blocks changes the sections (PAPER, reconciliation).
+
+In: `tiles.tif`, the model. Out: `sections.tif` (stack of tile windows, piece labels unique in the block), `pieces.parquet`,
+`links.parquet` (inner seams), `seams.npz` (label strips along the block's four sides, for `stitch`).
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from kibs_steps import cli, raster, scene, store
+from kibs_steps.grid import Block, Grid, Tile, Tiling, Window
+from kibs_steps.models import heads, runtime
+
+MIN_STRIP_IOU = 0.3  # two views of one section share most of the strip; a neighbour's rim shares a pixel line
+SIDES = ("north", "south", "west", "east")
+
+
+class View(NamedTuple):
+    """What one tile sees: labels (s, s) int32 over its full window, zero outside the data, and a score per label."""
+
+    tile: Tile
+    labels: np.ndarray
+    scores: np.ndarray
+
+
+def core_of(view: np.ndarray, tile: Tile, margin: int) -> np.ndarray:
+    """The core's part of a full-window array (s, s)."""
+    return view[margin : margin + tile.core.height, margin : margin + tile.core.width]
+
+
+def strip(view: np.ndarray, tile: Tile, side: str, margin: int) -> np.ndarray:
+    """The 2·margin px wide strip about one side of the tile's core, as that tile sees it, along the core's length."""
+    p, w, h = margin, tile.core.width, tile.core.height
+    return {
+        "north": view[: 2 * p, p : p + w],
+        "south": view[h : h + 2 * p, p : p + w],
+        "west": view[p : p + h, : 2 * p],
+        "east": view[p : p + h, w : w + 2 * p],
+    }[side]
+
+
+def links_across(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Pairs (n, 2) of labels that are one section, from two tiles' views of the same strip.
+
+    A pair is linked when each label overlaps the other more than any other, at an IoU of at least `MIN_STRIP_IOU` on the
+    strip. Ties go to the smaller label.
+    """
+    both = (first > 0) & (second > 0)
+    pairs, overlap = np.unique(np.stack([first[both], second[both]], axis=1), axis=0, return_counts=True)
+    if not len(pairs):
+        return np.zeros((0, 2), np.int64)
+    areas = [dict(zip(*np.unique(x[x > 0], return_counts=True), strict=True)) for x in (first, second)]
+    best: list[dict[int, int]] = [{}, {}]
+    for i in np.lexsort((pairs[:, 1], pairs[:, 0], -overlap)):
+        for k in (0, 1):
+            best[k].setdefault(int(pairs[i, k]), int(i))
+    linked = [
+        i
+        for i, ((a, b), n) in enumerate(zip(pairs, overlap, strict=True))
+        if best[0][int(a)] == best[1][int(b)] == i and n >= MIN_STRIP_IOU * (areas[0][a] + areas[1][b] - n)
+    ]
+    return pairs[linked].astype(np.int64)
+
+
+def detect(
+    rgb: np.ndarray,
+    valid: np.ndarray,
+    tiling: Tiling,
+    block: Block,
+    grid: Grid,
+    network: runtime.Network,
+    contract: dict,
+) -> list[View]:
+    """Run the 2D model on every tile of a block image (core grown by the margin; rgb uint8, valid bool).
+
+    Tiles without data are not run. Labels are numbered through the block, tile after tile.
+    """
+    core = tiling.block_core(block, grid.width, grid.height)
+    views, used = [], 0
+    for tile in tiling.tiles(block, grid.width, grid.height):
+        place = window_in_block(tiling.window(tile), core, tiling.margin)
+        image, data = padded(rgb, place), padded(valid, place, edge=False)
+        if core_of(data, tile, tiling.margin).any():
+            found = heads.decode_sections(network(image), contract)
+            labels = np.where(data, found.labels, 0)
+        else:
+            found, labels = None, np.zeros((tiling.tile, tiling.tile), np.int32)
+        scores = found.scores if found else np.zeros(0, np.float32)
+        views.append(View(tile, np.where(labels > 0, labels + used, 0).astype(np.int32), scores))
+        used += len(scores)
+    return views
+
+
+def window_in_block(window: Window, core: Window, margin: int) -> Window:
+    """A grid window in the pixels of a block image, which starts at the core's corner less the margin."""
+    return Window(window.col - core.col + margin, window.row - core.row + margin, window.width, window.height)
+
+
+def padded(image: np.ndarray, window: Window, edge: bool = True) -> np.ndarray:
+    """A window of an image; where it sticks out (last tiles of the raster) the edge is repeated, or zero."""
+    rows = np.arange(window.row, window.row + window.height)
+    cols = np.arange(window.col, window.col + window.width)
+    out = image[np.clip(rows, 0, image.shape[0] - 1)[:, None], np.clip(cols, 0, image.shape[1] - 1)]
+    if not edge:
+        out = out.copy()
+        out[rows >= image.shape[0]] = 0
+        out[:, cols >= image.shape[1]] = 0
+    return out
+
+
+def inner_links(views: list[View], margin: int) -> np.ndarray:
+    """Links (n, 2) across all seams between the given tiles."""
+    at = {(v.tile.row, v.tile.col): v for v in views}
+    found = [np.zeros((0, 2), np.int64)]
+    for (row, col), view in at.items():
+        for side, other_side, neighbour in (("east", "west", (row, col + 1)), ("south", "north", (row + 1, col))):
+            other = at.get(neighbour)
+            if other is not None:
+                found.append(
+                    links_across(
+                        strip(view.labels, view.tile, side, margin), strip(other.labels, other.tile, other_side, margin)
+                    )
+                )
+    return np.concatenate(found)
+
+
+def seams(views: list[View], margin: int) -> dict[str, np.ndarray]:
+    """The label strips along the block's four sides, tile after tile."""
+    rows = sorted({v.tile.row for v in views})
+    cols = sorted({v.tile.col for v in views})
+    at = {(v.tile.row, v.tile.col): v for v in views}
+
+    def along(side: str) -> np.ndarray:
+        if side in ("north", "south"):
+            row = rows[0] if side == "north" else rows[-1]
+            return np.concatenate([strip(at[row, c].labels, at[row, c].tile, side, margin) for c in cols], axis=1)
+        col = cols[0] if side == "west" else cols[-1]
+        return np.concatenate([strip(at[r, col].labels, at[r, col].tile, side, margin) for r in rows], axis=0)
+
+    return {side: along(side) for side in SIDES}
+
+
+PIECES = pa.schema(
+    [
+        ("label", pa.int64()),
+        ("tile_row", pa.int64()),
+        ("tile_col", pa.int64()),
+        ("score", pa.float64()),
+        ("core_area", pa.int64()),
+        ("full_area", pa.int64()),
+        ("void", pa.bool_()),
+        ("outline", pa.binary()),
+    ]
+)
+
+
+def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -> pa.Table:
+    """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it borders on no data."""
+    rows = []
+    p = tiling.margin
+    for view in views:
+        inside = core_of(view.labels, view.tile, p)
+        outlines = pixel_outlines(inside, view.tile.core)
+        full = np.bincount(view.labels.ravel(), minlength=1)
+        place = window_in_block(view.tile.core, core, p)
+        blank = ~valid[place.row : place.row + place.height, place.col : place.col + place.width]
+        near_blank = set(np.unique(inside[grown(blank)]).tolist()) if blank.any() else set()
+        first = int(view.labels[view.labels > 0].min(initial=np.iinfo(np.int32).max))
+        for label in np.unique(view.labels[view.labels > 0]).tolist():
+            outline = outlines.get(label)
+            rows.append(
+                {
+                    "label": label,
+                    "tile_row": view.tile.row,
+                    "tile_col": view.tile.col,
+                    "score": float(view.scores[label - first]) if label - first < len(view.scores) else 0.0,
+                    "core_area": int((inside == label).sum()),
+                    "full_area": int(full[label]),
+                    "void": label in near_blank,
+                    "outline": outline,
+                }
+            )
+    return pa.Table.from_pylist(rows, schema=PIECES)
+
+
+def grown(mask: np.ndarray) -> np.ndarray:
+    """The mask and its 8-neighbours."""
+    from scipy import ndimage
+
+    return ndimage.binary_dilation(mask, np.ones((3, 3), bool))
+
+
+def pixel_outlines(labels: np.ndarray, window: Window) -> dict[int, bytes]:
+    """WKB (Multi)Polygon of every label of a window along its pixels' edges, in image coordinates (px)."""
+    import shapely
+    from rasterio.features import shapes
+    from rasterio.transform import Affine
+
+    parts: dict[int, list] = {}
+    if labels.any():
+        place = Affine.translation(window.col, window.row)
+        for shape, value in shapes(labels.astype(np.int32), mask=labels > 0, connectivity=4, transform=place):
+            rings = shape["coordinates"]
+            parts.setdefault(int(value), []).append(shapely.Polygon(rings[0], rings[1:]))
+    return {k: shapely.to_wkb(v[0] if len(v) == 1 else shapely.MultiPolygon(v)) for k, v in parts.items()}
+
+
+def stack(arrays: dict[tuple[int, int], np.ndarray], side: int) -> np.ndarray:
+    """Full-window arrays (s, s[, bands]) of tiles (row, col) laid side by side without overlap."""
+    rows = sorted({r for r, _ in arrays})
+    cols = sorted({c for _, c in arrays})
+    any_array = next(iter(arrays.values()))
+    out = np.zeros((len(rows) * side, len(cols) * side, *any_array.shape[2:]), any_array.dtype)
+    for (r, c), array in arrays.items():
+        i, j = rows.index(r) * side, cols.index(c) * side
+        out[i : i + side, j : j + side] = array
+    return out
+
+
+def unstack(image: np.ndarray, tiles: list[Tile], side: int) -> dict[tuple[int, int], np.ndarray]:
+    """The inverse of `stack` for the same tiles."""
+    row0, col0 = min(t.row for t in tiles), min(t.col for t in tiles)
+    return {(t.row, t.col): image[(t.row - row0) * side :, (t.col - col0) * side :][:side, :side] for t in tiles}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Find the roof sections of one block."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.sections", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--tiles", required=True, help="tiles.tif of the block")
+    parser.add_argument("--model", required=True, help="models/sections.json")
+    parser.add_argument("--name", required=True, help="block name")
+    parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--labels", required=True, help="out: sections.tif")
+    parser.add_argument("--pieces", required=True, help="out: pieces.parquet")
+    parser.add_argument("--links", required=True, help="out: links.parquet")
+    parser.add_argument("--seams", required=True, help="out: seams.npz")
+    args = parser.parse_args(argv)
+    facts = scene.read(args.scene)
+    model = runtime.from_record(args.model, "sections")
+    tiling = Tiling(model.contract["tile"], model.contract["margin"], args.block)
+    block = tiling.block_of(args.name)
+    core = tiling.block_core(block, facts.grid.width, facts.grid.height)
+    image = raster.read(args.tiles)
+    rgb, valid = image[..., :3], image[..., 3] > 0
+    geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
+    network = runtime.open_network(model, geometry)
+    views = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
+    links = inner_links(views, tiling.margin)
+    raster.write(args.labels, stack({(v.tile.row, v.tile.col): v.labels.astype(np.uint32) for v in views}, tiling.tile))
+    store.write_table(args.pieces, pieces(views, valid, tiling, core))
+    store.write_table(args.links, pa.table({"first": links[:, 0], "second": links[:, 1]}))
+    store.write_arrays(args.seams, seams(views, tiling.margin))
+
+
+if __name__ == "__main__":
+    cli.run(main)
