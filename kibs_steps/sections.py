@@ -159,12 +159,17 @@ PIECES = pa.schema(
         ("full_area", pa.int64()),
         ("void", pa.bool_()),
         ("outline", pa.binary()),
+        ("split", pa.int64()),
+        ("owner", pa.int64()),
     ]
 )
 
 
 def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -> pa.Table:
-    """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it borders on no data."""
+    """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it borders on no data.
+
+    `split` and `owner` are for truth that is fed instead of detections: 2 (none) and 0 here.
+    """
     rows = []
     p = tiling.margin
     for view in views:
@@ -187,6 +192,8 @@ def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -
                     "full_area": int(full[label]),
                     "void": label in near_blank,
                     "outline": outline,
+                    "split": 2,
+                    "owner": 0,
                 }
             )
     return pa.Table.from_pylist(rows, schema=PIECES)

@@ -1,0 +1,312 @@
+"""Planes: a plane for every section from its corners, fitted in the map frame.
+
+An off-nadir image shears roofs (at 59.3° elevation a 40° slope looks 29° steep where it faces the satellite, 59° where it
+faces away), so corners are first moved to where they stand (PAPER, off-nadir geometry), then filed to sections, then fitted.
+
+Two rules. `paper`: the three corners of the largest triangle; a triangle under 20 % or over 200 % of the section's area is
+not trusted; two corners or one give a flat plane at their mean height, none the model's mean height. `robust` (default):
+least squares over all corners, weighted by 1/σ², outliers by Tukey's biweight, with a weak prior on the slope so that corners
+in a row leave the plane level across that row. Every section keeps a **status** with its reason.
+
+In: stitched sections and corners, DTM, view. Out: `planes.parquet`, `filed_corners.parquet`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from kibs_steps import cli, scene, store, view
+from kibs_steps.view import Plane
+
+SHARED = 2.0  # px: a corner on a ridge or eave belongs to every section whose rim is as near, up to this
+SLOPE_PRIOR = 0.7  # standard deviation of a roof's gradient per axis: 35° is ordinary, 60° is rare
+SIGMA_FLOOR = 0.02  # m
+TUKEY = 4.0  # residuals beyond 4 σ do not count
+MAX_SLOPE = 72.0  # deg, in the map frame
+MAX_HEIGHT = 200.0  # m above ground: taller than any building of a city without high-rises is a mistake
+MIN_AREA = 12.0  # px: smaller areas are specks, not roofs
+TRIANGLE = (0.2, 2.0)  # share of the section's area between which its triangle is trusted (PAPER, planes)
+
+PLANE_FIELDS = [("plane_a", pa.float64()), ("plane_b", pa.float64()), ("plane_c", pa.float64())]
+PLANE_FIELDS += [("x0", pa.float64()), ("y0", pa.float64()), ("height_sigma", pa.float64()), ("n_corners", pa.int64())]
+PLANE_FIELDS += [("status", pa.string()), ("status_reason", pa.string())]
+
+
+class Points(NamedTuple):
+    """Corners in the map frame: x, y, z (m, absolute), height above ground (m) and σ (m)."""
+
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    height: np.ndarray
+    sigma: np.ndarray
+
+    def take(self, index: np.ndarray) -> Points:
+        """The chosen points."""
+        return Points(*(column[index] for column in self))
+
+
+class Fit(NamedTuple):
+    """A plane, the σ of its height at the section's middle (m), a status and its reason."""
+
+    plane: Plane
+    sigma: float
+    status: str
+    reason: str
+
+
+def file_corners(
+    outlines: np.ndarray, corners: np.ndarray, owner: np.ndarray, owners: np.ndarray, reach: float, shared: float
+):
+    """Which corners belong to which section: arrays (section index, corner index), sorted.
+
+    A corner goes to the sections whose rim is nearest: within `reach` px, and within `shared` px of the nearest one, so
+    neighbours on a ridge both get it and a section further off does not (0 gives it to the nearest alone). `corners` (n, 2)
+    px. Corners with an owner go to the section of that owner alone.
+    """
+    if not len(outlines) or not len(corners):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    points = shapely.points(corners)
+    free = np.flatnonzero(owner == 0)
+    tree = shapely.STRtree(shapely.boundary(outlines))
+    corner, section = tree.query(points[free], predicate="dwithin", distance=reach)
+    corner = free[corner]
+    distance = shapely.distance(points[corner], shapely.boundary(outlines)[section])
+    nearest = np.full(len(corners), np.inf)
+    np.minimum.at(nearest, corner, distance)
+    keep = distance <= nearest[corner] + shared
+    corner, section = corner[keep], section[keep]
+    at = {int(o): i for i, o in enumerate(owners) if o}
+    owned = np.array([(at[int(o)], i) for i, o in enumerate(owner) if o and int(o) in at], np.int64).reshape(-1, 2)
+    section, corner = np.r_[section, owned[:, 0]], np.r_[corner, owned[:, 1]]
+    order = np.lexsort((corner, section))
+    return section[order], corner[order]
+
+
+def flat(z: float, middle: np.ndarray) -> Plane:
+    """A level plane."""
+    return Plane(0.0, 0.0, float(z), float(middle[0]), float(middle[1]))
+
+
+def robust_plane(points: Points, middle: np.ndarray) -> tuple[Plane, float]:
+    """Least squares plane through points, and the σ of its height at `middle` (map, m).
+
+    Weights 1/σ² and Tukey's biweight (10 rounds from a Huber start); gradient prior N(0, `SLOPE_PRIOR`²).
+    """
+    sigma = np.maximum(points.sigma, SIGMA_FLOOR)
+    design = np.column_stack([points.x - middle[0], points.y - middle[1], np.ones(len(sigma))])
+    prior = np.diag([SLOPE_PRIOR**-2, SLOPE_PRIOR**-2, 0.0])
+    weight = sigma**-2
+    robust = np.ones(len(sigma))
+    for turn in range(12):
+        w = weight * robust
+        normal = design.T @ (w[:, None] * design) + prior
+        solution = np.linalg.solve(normal, design.T @ (w * points.z))
+        residual = np.abs(points.z - design @ solution) / sigma
+        scale = max(1.0, float(np.median(residual)) / 0.6745)
+        if turn < 2:
+            robust = np.minimum(1.0, 1.5 * scale / np.maximum(residual, 1e-9))
+        else:
+            robust = np.maximum((1 - np.minimum(residual / (TUKEY * scale), 1.0) ** 2) ** 2, 1e-6)
+    variance = np.linalg.inv(normal)[2, 2] * scale**2
+    return Plane(*map(float, solution), float(middle[0]), float(middle[1])), float(np.sqrt(variance))
+
+
+def largest_triangle(x: np.ndarray, y: np.ndarray) -> tuple[tuple[int, int, int], float]:
+    """The three of n ≥ 3 points with the largest triangle, and its area (m²); ties go to the first.
+
+    Its corners lie on the convex hull, so only those are tried.
+    """
+    hull = np.arange(len(x))
+    if len(x) > 8:
+        from scipy.spatial import ConvexHull, QhullError
+
+        try:
+            hull = np.sort(ConvexHull(np.column_stack([x, y])).vertices)
+        except QhullError:
+            hull = np.arange(len(x))[:8]
+    triples = np.array(list(combinations(hull.tolist(), 3)))
+    a, b, c = triples.T
+    area = np.abs((x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])) / 2
+    best = int(np.argmax(area))
+    return tuple(triples[best].tolist()), float(area[best])
+
+
+def filed_heights(z1: float, z2: float, z3: float) -> tuple[float, float, float]:
+    """The paper's filing of three heights z1 < z2 < z3: the middle one joins the nearer of the others at their mean.
+
+    Equal heights are left as they are (PAPER, filing of heights).
+    """
+    if not z1 < z2 < z3:
+        return z1, z2, z3
+    if z2 < (z1 + z3) / 2:
+        mean = (z1 + z2) / 2
+        return mean, mean, z3
+    mean = (z2 + z3) / 2
+    return z1, mean, mean
+
+
+def triangle_plane(points: Points, triple: tuple[int, int, int], middle: np.ndarray) -> Plane:
+    """The plane through three points after `filed_heights` on their heights above ground."""
+    index = np.array(triple)
+    index = index[np.argsort(points.height[index], kind="stable")]
+    ground = points.z[index] - points.height[index]
+    z = ground + np.array(filed_heights(*points.height[index]))
+    design = np.column_stack([points.x[index] - middle[0], points.y[index] - middle[1], np.ones(3)])
+    return Plane(*map(float, np.linalg.solve(design, z)), float(middle[0]), float(middle[1]))
+
+
+def fit(
+    points: Points, area: float, middle: np.ndarray, ground: float, fallback: tuple[float, float], rule: str
+) -> Fit:
+    """A section's plane from its corners.
+
+    `area` m² of the section in plan, `middle` (2,) map m, `ground` DTM there (m), `fallback` the model's mean height and σ
+    (m above ground), `rule` robust or paper.
+    """
+    n = len(points.z)
+    if n == 0:
+        reason = f"no corner was found; the model's mean height {fallback[0]:.2f} m is used"
+        return Fit(flat(ground + fallback[0], middle), fallback[1], "no_corners", reason)
+    if n < 3:
+        sigma = float(np.sqrt((np.maximum(points.sigma, SIGMA_FLOOR) ** 2).sum()) / n)
+        status = "one_corner" if n == 1 else "two_corners"
+        reason = f"{'one corner gives' if n == 1 else 'two corners give'} a level plane at the mean height"
+        return Fit(flat(ground + points.height.mean(), middle), sigma, status, reason)
+    triple, triangle = largest_triangle(points.x, points.y)
+    share = triangle / max(area, 1e-9)
+    plane, sigma = robust_plane(points, middle)
+    trusted = share >= TRIANGLE[0] and (share <= TRIANGLE[1] or rule == "robust")
+    if rule == "paper":
+        if not trusted:
+            reason = f"largest triangle of corners is {share:.0%} of the section; level at the model's mean height"
+            return Fit(flat(ground + fallback[0], middle), fallback[1], "degenerate_triangle", reason)
+        plane = triangle_plane(points, triple, middle)
+    elif not trusted:
+        reason = f"corners span {share:.0%} of the section: level across the direction they do not span"
+        return Fit(plane, sigma, "degenerate_triangle", reason)
+    return Fit(plane, sigma, "ok", "")
+
+
+def checked(
+    found: Fit, points: Points, area_px: float, ground: float, middle: np.ndarray, edge: bool, void: bool
+) -> Fit:
+    """The fit with its plausibility: slope, height, size, place in the raster. What comes first in DESIGN's list gives way.
+
+    An implausible slope is replaced by a level plane at the corners' median height; an implausible height keeps its plane.
+    """
+    slope = np.degrees(np.arctan(np.hypot(found.plane.a, found.plane.b)))
+    if slope > MAX_SLOPE:
+        level = flat(ground + float(np.median(points.height)), middle)
+        found = Fit(
+            level, found.sigma, "implausible_slope", f"fitted slope {slope:.0f}° exceeds {MAX_SLOPE:.0f}°; made level"
+        )
+    height = float(found.plane.at(middle)) - ground
+    if not 0.3 <= height <= MAX_HEIGHT:
+        found = found._replace(status="implausible_height", reason=f"mean height {height:.1f} m above ground")
+    if area_px < MIN_AREA:
+        found = found._replace(status="too_small", reason=f"{area_px:.0f} px is too small to be trusted")
+    if void:
+        found = found._replace(status="cloud_or_nodata", reason="touches an area without data: its outline is cut")
+    if edge:
+        found = found._replace(status="raster_edge", reason="cut by the raster's edge: its outline goes on outside")
+    return found
+
+
+def planes(
+    sections: pa.Table,
+    corners: pa.Table,
+    facts: scene.Scene,
+    dtm: view.Surface,
+    fallback: tuple[float, float],
+    reach: float,
+    rule: str,
+) -> tuple[pa.Table, pa.Table]:
+    """Sections with planes, and corners filed to them (one row per pair), both sorted by section.
+
+    `reach` px; `fallback` (mean height, σ) m.
+    """
+    outlines = shapely.from_wkb(sections["outline"].to_numpy(zero_copy_only=False))
+    pixel = np.stack([corners["col"].to_numpy(), corners["row"].to_numpy()], axis=1)
+    height = corners["height"].to_numpy()
+    base = facts.projected_on(dtm)
+    where, z = view.ground_position(facts.grid.to_map(pixel), height, dtm, facts.lean, base)
+    points = Points(where[:, 0], where[:, 1], z, height, corners["sigma"].to_numpy())
+    shared = SHARED if rule == "robust" else 0.0
+    section, corner = file_corners(
+        outlines, pixel, corners["owner"].to_numpy(), sections["owner"].to_numpy(), reach, shared
+    )
+    area_px = shapely.area(outlines)
+    centre = (
+        facts.grid.to_map(shapely.get_coordinates(shapely.centroid(outlines))) if len(outlines) else np.zeros((0, 2))
+    )
+    rows = []
+    bounds = np.searchsorted(section, np.arange(len(outlines) + 1))
+    edge, void = sections["edge"].to_pylist(), sections["void"].to_pylist()
+    for i in range(len(outlines)):
+        mine = points.take(corner[bounds[i] : bounds[i + 1]])
+        typical = float(np.median(mine.height)) if len(mine.z) else fallback[0]
+        middle, _ = view.ground_position(centre[i : i + 1], np.array([typical]), dtm, facts.lean, base)
+        ground = float(dtm(middle)[0])
+        found = fit(mine, area_px[i] * facts.grid.gsd**2, middle[0], ground, fallback, rule)
+        found = checked(found, mine, area_px[i], ground, middle[0], edge[i], void[i])
+        rows.append([*found.plane, found.sigma, len(mine.z), found.status, found.reason])
+    table = sections.select(["section_id", "outline", "score", "split"])
+    for k, (name, kind) in enumerate(PLANE_FIELDS):
+        table = table.append_column(name, pa.array([row[k] for row in rows], kind))
+    filed = pa.table(
+        {
+            "section_id": sections["section_id"].to_numpy()[section],
+            "x": points.x[corner],
+            "y": points.y[corner],
+            "z": points.z[corner],
+            "col": pixel[corner, 0],
+            "row": pixel[corner, 1],
+            "height": height[corner],
+            "sigma": points.sigma[corner],
+            "score": corners["score"].to_numpy()[corner],
+        }
+    )
+    return table, filed
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Fit a plane to every section of one block."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.planes", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--sections", required=True, help="stitched_sections.parquet")
+    parser.add_argument("--corners", required=True, help="stitched_corners.parquet")
+    parser.add_argument("--model", required=True, help="models/corners.json: mean height where no corner is found")
+    parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
+    parser.add_argument("--rule", choices=["robust", "paper"], default="robust")
+    parser.add_argument("--planes", required=True, help="out: planes.parquet")
+    parser.add_argument("--filed", required=True, help="out: filed_corners.parquet")
+    args = parser.parse_args(argv)
+    facts = scene.read(args.scene)
+    heights = store.read_json(args.model)["contract"]["heights"]
+    sections, corners = store.read_table(args.sections), store.read_table(args.corners)
+    dtm = facts.terrain(map_bounds(sections, facts))
+    fallback = (heights["fallback"], heights.get("fallback_sigma", 3.0))
+    table, filed = planes(sections, corners, facts, dtm, fallback, args.reach, args.rule)
+    store.write_table(args.planes, table)
+    store.write_table(args.filed, filed)
+
+
+def map_bounds(sections: pa.Table, facts: scene.Scene) -> tuple[float, float, float, float]:
+    """Bounds (left, bottom, right, top; image map frame, m) of a table's outlines; the scene's corner if it has none."""
+    if not len(sections):
+        left, _, _, top = facts.grid.bounds
+        return left, top, left, top
+    x0, y0, x1, y1 = shapely.total_bounds(shapely.from_wkb(sections["outline"].to_numpy(zero_copy_only=False)))
+    (left, top), (right, bottom) = facts.grid.to_map(np.array([[x0, y0], [x1, y1]]))
+    return float(left), float(bottom), float(right), float(top)
+
+
+if __name__ == "__main__":
+    cli.run(main)
