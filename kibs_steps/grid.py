@@ -49,6 +49,11 @@ class Grid(NamedTuple):
         """(left, bottom, right, top) in map metres."""
         return (self.x0, self.y0 - self.height * self.gsd, self.x0 + self.width * self.gsd, self.y0)
 
+    def part(self, window: Window) -> Grid:
+        """The grid of a window: same pixels, its own corner and size."""
+        left, top = self.to_map(np.array([window.col, window.row]))
+        return self._replace(x0=float(left), y0=float(top), width=window.width, height=window.height)
+
     def to_map(self, col_row: np.ndarray) -> np.ndarray:
         """Map metres (n, 2) of image coordinates (n, 2)."""
         col_row = np.asarray(col_row, float)
@@ -96,7 +101,9 @@ class Tiling(NamedTuple):
         """All blocks, row by row."""
         rows, cols = self.shape(width, height)
         return [
-            Block(f"r{i:03d}c{j:03d}", i, j) for i in range(-(-rows // self.block)) for j in range(-(-cols // self.block))
+            Block(f"r{i:03d}c{j:03d}", i, j)
+            for i in range(-(-rows // self.block))
+            for j in range(-(-cols // self.block))
         ]
 
     def block_of(self, name: str) -> Block:
