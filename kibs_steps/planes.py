@@ -280,8 +280,9 @@ def main(argv: list[str] | None = None) -> None:
     """Fit a plane to every section of one block."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.planes", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
-    parser.add_argument("--sections", required=True, help="stitched_sections.parquet")
-    parser.add_argument("--corners", required=True, help="stitched_corners.parquet")
+    parser.add_argument("--sections", required=True, help="stitched/sections.parquet")
+    parser.add_argument("--corners", required=True, help="stitched/corners.parquet")
+    parser.add_argument("--name", required=True, help="block name")
     parser.add_argument("--model", required=True, help="models/corners.json: mean height where no corner is found")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--rule", choices=["robust", "paper"], default="robust")
@@ -290,7 +291,7 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     heights = store.read_json(args.model)["contract"]["heights"]
-    sections, corners = store.read_table(args.sections), store.read_table(args.corners)
+    sections, corners = (store.read_table(f, block=args.name) for f in (args.sections, args.corners))
     dtm = facts.terrain(map_bounds(sections, facts))
     fallback = (heights["fallback"], heights.get("fallback_sigma", 3.0))
     table, filed = planes(sections, corners, facts, dtm, fallback, args.reach, args.rule)

@@ -5,8 +5,8 @@ blocks found here from the stored strips; a section is a connected group of link
 beyond its own tile's core and which no neighbour confirms is voted out: the tile that answers for that place does not see it.
 Union-find has no order, so results depend neither on the order of blocks nor on their size.
 
-In: all blocks' pieces, links, seams and corners. Out, per block: `stitched_sections.parquet` (the sections whose id pixel is
-in the block's core) and `stitched_corners.parquet` (the corners within reach of those sections).
+In: all blocks' pieces, links, seams and corners. Out: `stitched/sections.parquet` (each section in the block that holds its id
+pixel) and `stitched/corners.parquet` (the corners within reach of each block's sections), both with a column `block`.
 """
 
 from __future__ import annotations
@@ -236,12 +236,14 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
     parser.add_argument("--tolerance", type=float, required=True, help="smoothing of pixel outlines, px; 0 for none")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
-    parser.add_argument("--folders", nargs="+", required=True, help="the blocks' folders, named as the blocks")
+    parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
+    parser.add_argument("--sections", required=True, help="out: sections of all blocks")
+    parser.add_argument("--corners", required=True, help="out: corners of all blocks")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     tiling = Tiling(args.tile, args.margin, args.block)
     folders = [Path(f) for f in args.folders]
-    blocks = [tiling.block_of(f.name) for f in folders]
+    blocks = [tiling.block_of(f.parent.name) for f in folders]
     found = stitch(
         blocks,
         [store.read_table(f / "pieces.parquet") for f in folders],
@@ -253,9 +255,9 @@ def main(argv: list[str] | None = None) -> None:
         args.tolerance,
         args.reach,
     )
-    for folder, sections, corners in zip(folders, *found, strict=True):
-        store.write_table(folder / "stitched_sections.parquet", sections)
-        store.write_table(folder / "stitched_corners.parquet", corners)
+    names = [b.name for b in blocks]
+    store.write_by_block(args.sections, dict(zip(names, found[0], strict=True)))
+    store.write_by_block(args.corners, dict(zip(names, found[1], strict=True)))
 
 
 if __name__ == "__main__":

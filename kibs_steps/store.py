@@ -64,9 +64,20 @@ def write_table(path: str | Path, table: pa.Table) -> None:
         pq.write_table(table, temporary, compression="zstd")
 
 
-def read_table(path: str | Path, columns: list[str] | None = None) -> pa.Table:
-    """Read a Parquet table; a damaged file raises `DamagedFile`."""
+def write_by_block(path: str | Path, tables: dict[str, pa.Table]) -> None:
+    """Write one table per block to one Parquet file, with a column `block` and row groups a reader of one block can skip."""
+    with whole(path) as temporary:
+        schema = next(iter(tables.values())).schema.append(pa.field("block", pa.string()))
+        with pq.ParquetWriter(temporary, schema, compression="zstd") as target:
+            for name, table in tables.items():
+                target.write_table(table.append_column("block", pa.array([name] * len(table), pa.string())))
+
+
+def read_table(path: str | Path, columns: list[str] | None = None, block: str | None = None) -> pa.Table:
+    """Read a Parquet table, or one block's rows of it (without the column `block`); damage raises `DamagedFile`."""
     try:
+        if block is not None:
+            return pq.read_table(path, columns=columns, filters=[("block", "=", block)]).drop_columns(["block"])
         return pq.read_table(path, columns=columns)
     except (pa.ArrowInvalid, OSError) as error:
         if isinstance(error, FileNotFoundError):

@@ -1,0 +1,187 @@
+"""The plan of a run: from `config.yaml` to scenes, their grids, blocks and signatures, before any job starts.
+
+A **signature** is a hash of all content a step's result depends on: input files, models, settings, the package's version. The
+workflow gives it to every rule as a parameter, so Snakemake reruns exactly the steps whose content changed, whatever the
+dates of files say and wherever an earlier run was killed.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from kibs_steps import fingerprint
+from kibs_steps.errors import KibsError
+from kibs_steps.grid import Block, Tiling
+from kibs_steps.models import contract
+
+RUN_KEYS = ("scene", "scenes", "train")
+DEFAULTS = {
+    "models": "research",
+    "method": "two_stage",
+    "planes": "robust",
+    "block": 8,
+    "feed": "models",
+    "truth_frame": "map",
+    "truth_z": "absolute",
+    "allow_angles": False,
+    "lod_label": "2.0",
+}
+SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
+REACH = 7.5  # px: half the paper's corner square q = 15, unless the model's contract says otherwise
+TOLERANCE = 1.5  # px: how far smoothing may move a pixel outline
+
+
+class BadConfig(KibsError):
+    """The configuration cannot be used."""
+
+
+class Plan(NamedTuple):
+    """One scene: settings (defaults filled in), its files, grid size, tiles, blocks, models and signatures by step."""
+
+    name: str
+    settings: dict[str, Any]
+    raster: str
+    dtm: str
+    truth: str | None
+    tiling: Tiling
+    blocks: list[Block]
+    models: dict[str, contract.Model]
+    signature: dict[str, str]
+
+    @property
+    def reach(self) -> float:
+        """How far a corner may lie from its section, px."""
+        return self.models["corners"].contract["thresholds"].get("corner_radius", REACH)
+
+    @property
+    def tolerance(self) -> float:
+        """How far smoothing may move an outline, px; truth keeps its exact outlines."""
+        return 0.0 if self.settings["feed"] == "truth" else TOLERANCE
+
+
+def scenes(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Settings of every scene to build, by name, after the schema; defaults are filled in. Raises `BadConfig`."""
+    import jsonschema
+
+    check = jsonschema.Draft202012Validator(schema)
+    error = jsonschema.exceptions.best_match(check.iter_errors(config))
+    if error:
+        place = ".".join(map(str, error.absolute_path)) or "config"
+        raise BadConfig(f"{place}: {error.message}")
+    common = {k: v for k, v in config.items() if k not in RUN_KEYS}
+    listed = config.get("scenes") or {}
+    wanted = [str(config["scene"])] if config.get("scene") else list(listed)
+    if not wanted:
+        raise BadConfig(
+            "no scene to build: add one under `scenes:` in config.yaml, or give --config scene=NAME raster=FILE"
+        )
+    return {name: {**DEFAULTS, **(listed.get(name) or {}), **common} for name in wanted}
+
+
+def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan:
+    """Plan one scene. `base` is the workflow's folder (for `models/NAME`), `results` where results go.
+
+    Raises named errors for whatever makes the run impossible.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
+    models = {
+        task: contract.load(folder_of(settings["models"], base) / f"{task}.onnx", task)
+        for task in ("sections", "corners")
+    }
+    contract.agree(list(models.values()))
+    terms = models["sections"].contract
+    tiling = Tiling(terms["tile"], terms["margin"], int(settings["block"]))
+    cache = results / ".fingerprints.json"
+    folder = results / name
+    simulated = settings.get("simulate")
+    if simulated is not None:
+        simulated = {**SIMULATED, **simulated}
+        settings = {**settings, "simulate": simulated}
+        for key in ("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"):
+            if key not in settings:
+                raise BadConfig(f"scene {name}: a simulated scene needs {key}")
+        raster, dtm, truth = (str(folder / "simulated" / f) for f in ("scene.tif", "dtm.tif", "truth.gpkg"))
+        if abs(simulated["gsd"] / terms["gsd"] - 1) > 0.005:
+            raise BadConfig(f"scene {name}: simulate.gsd {simulated['gsd']} m, the models work at {terms['gsd']} m")
+        width = height = int(simulated["size"])
+        source = fingerprint.of_values(
+            simulated, [settings[f"{k}_{a}"] for k in ("view", "sun") for a in ("azimuth", "elevation")]
+        )
+        truth_source = source
+    else:
+        raster, dtm, truth = settings.get("raster"), settings.get("dtm"), settings.get("truth")
+        if not raster:
+            raise BadConfig(f"scene {name}: which raster? Give raster=FILE (or `simulate:`)")
+        if dtm is None:
+            raise BadConfig(
+                f"scene {name}: which terrain? Give dtm=FILE, or dtm=NUMBER for flat ground at that height (m)"
+            )
+        dtm = str(dtm)
+        width, height = grid_size(raster, terms["gsd"], settings.get("aoi"))
+        source = [fingerprint.of_file(f, cache) if Path(f).is_file() else f for f in (raster, dtm)]
+        truth_source = fingerprint.of_file(truth, cache) if truth and Path(truth).is_file() else truth
+    if settings["feed"] == "truth" and not truth:
+        raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
+    blocks = tiling.blocks(width, height)
+    signature = signatures(settings, source, truth_source, models, tiling, cache)
+    return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature)
+
+
+def folder_of(models: str, base: Path) -> Path:
+    """The folder of a model set: a name under `models/`, or a path."""
+    named = base / "models" / models
+    return named if named.is_dir() else Path(models)
+
+
+def grid_size(raster: str, gsd: float, aoi: str | None) -> tuple[int, int]:
+    """Width and height (px) of the model grid over a raster, from its header."""
+    from kibs_steps.scene import model_grid
+
+    grid = model_grid(raster, gsd, aoi)
+    return grid.width, grid.height
+
+
+def signatures(
+    settings: dict[str, Any], source: Any, truth: Any, models: dict[str, contract.Model], tiling: Tiling, cache: Path
+) -> dict[str, str]:
+    """Signature of every step: each hashes what it uses itself and the signatures it builds on."""
+    h = fingerprint.of_values
+    pick = {k: settings.get(k) for k in settings}
+
+    def some(*keys: str) -> list[Any]:
+        return [pick.get(k) for k in keys]
+
+    def content(key: str) -> Any:
+        value = settings.get(key)
+        return fingerprint.of_file(value, cache) if value and Path(value).is_file() else value
+
+    angles = some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation")
+    seen = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
+    s = {"source": h(version("kibs-steps"), source)}
+    s["scene"] = h(
+        s["source"],
+        angles,
+        some("projection_height", "bands", "vertical_crs"),
+        content("aoi"),
+        models["sections"].contract["gsd"],
+    )
+    s["truth"] = h(s["scene"], truth, some("truth_frame", "truth_z"))
+    s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
+    for task, model in models.items():
+        s[f"model_{task}"] = h(model.sha256, angles, settings["allow_angles"], str(model.path))
+    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"])
+    s["blend"] = h(s["sections"], models["corners"].sha256)
+    s["corners"] = h(s["blend"], seen["corners"])
+    s["feed"] = h(s["truth"], tiling)
+    s["stitch"] = h(s["feed"] if settings["feed"] == "truth" else s["corners"])
+    s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
+    s["buildings"] = h(s["planes"], content("footprints"))
+    s["solids"] = h(s["buildings"], settings["lod_label"])
+    s["evaluate"] = h(s["planes"], s["truth"])
+    s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
+    return s

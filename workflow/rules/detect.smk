@@ -1,0 +1,137 @@
+# Sections and corners of every block, by the models or from the truth, and their union over the seams.
+
+
+rule sections:
+    """Find the roof sections of one block with the 2D model."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        tiles=ancient("results/{scene}/blocks/{block}/tiles.tif"),
+        model=ancient("results/{scene}/models/sections.json"),
+    output:
+        labels="results/{scene}/blocks/{block}/sections.tif",
+        pieces="results/{scene}/blocks/{block}/detected/pieces.parquet",
+        links="results/{scene}/blocks/{block}/detected/links.parquet",
+        seams="results/{scene}/blocks/{block}/detected/seams.npz",
+    log:
+        "results/{scene}/logs/sections/{block}.log",
+    params:
+        signature=signature("sections"),
+        block=lambda w: plan(w).tiling.block,
+    shell:
+        "python -m kibs_steps.sections --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
+        " --name {wildcards.block} --block {params.block} --labels {output.labels:q} --pieces {output.pieces:q}"
+        " --links {output.links:q} --seams {output.seams:q} > {log:q} 2>&1"
+
+
+rule blend:
+    """Paint the sections into the image, as the 3D model's contract says."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        tiles=ancient("results/{scene}/blocks/{block}/tiles.tif"),
+        labels=ancient("results/{scene}/blocks/{block}/sections.tif"),
+        model=ancient("results/{scene}/models/corners.json"),
+    output:
+        temp("results/{scene}/blocks/{block}/blended.tif"),
+    log:
+        "results/{scene}/logs/blend/{block}.log",
+    params:
+        signature=signature("blend"),
+        block=lambda w: plan(w).tiling.block,
+    shell:
+        "python -m kibs_steps.blend --scene {input.scene:q} --tiles {input.tiles:q} --labels {input.labels:q}"
+        " --model {input.model:q} --name {wildcards.block} --block {params.block} --out {output:q} > {log:q} 2>&1"
+
+
+rule corners:
+    """Find the roof corners of one block and their heights with the 3D model."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        blended=ancient("results/{scene}/blocks/{block}/blended.tif"),
+        model=ancient("results/{scene}/models/corners.json"),
+    output:
+        "results/{scene}/blocks/{block}/detected/corners.parquet",
+    log:
+        "results/{scene}/logs/corners/{block}.log",
+    params:
+        signature=signature("corners"),
+        block=lambda w: plan(w).tiling.block,
+    shell:
+        "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --model {input.model:q}"
+        " --name {wildcards.block} --block {params.block} --out {output:q} > {log:q} 2>&1"
+
+
+rule truth:
+    """The truth layer in the image frame and the map frame."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        truth=lambda w: ancient(plan(w).truth),
+    output:
+        "results/{scene}/truth.parquet",
+    log:
+        "results/{scene}/logs/truth.log",
+    params:
+        signature=signature("truth"),
+        frame=lambda w: plan(w).settings["truth_frame"],
+        z=lambda w: plan(w).settings["truth_z"],
+    shell:
+        "python -m kibs_steps.truth --scene {input.scene:q} --truth {input.truth:q} --frame {params.frame}"
+        " --z {params.z} --out {output:q} > {log:q} 2>&1"
+
+
+rule feed:
+    """The truth of one block in the place of both models."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        truth=ancient("results/{scene}/truth.parquet"),
+    output:
+        pieces="results/{scene}/blocks/{block}/fed/pieces.parquet",
+        links="results/{scene}/blocks/{block}/fed/links.parquet",
+        seams="results/{scene}/blocks/{block}/fed/seams.npz",
+        corners="results/{scene}/blocks/{block}/fed/corners.parquet",
+    log:
+        "results/{scene}/logs/feed/{block}.log",
+    params:
+        signature=signature("feed"),
+        tiling=lambda w: plan(w).tiling,
+    shell:
+        "python -m kibs_steps.feed --scene {input.scene:q} --truth {input.truth:q} --tile {params.tiling.tile}"
+        " --margin {params.tiling.margin} --name {wildcards.block} --block {params.tiling.block}"
+        " --pieces {output.pieces:q} --links {output.links:q} --seams {output.seams:q}"
+        " --corners {output.corners:q} > {log:q} 2>&1"
+
+
+def source(wildcards):
+    """The folder of a block's detections: by the models, or fed from the truth."""
+    return "fed" if plan(wildcards).settings["feed"] == "truth" else "detected"
+
+
+rule stitch:
+    """Join the pieces of all blocks to sections."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        detections=lambda w: [
+            ancient(f"results/{w.scene}/blocks/{b.name}/{source(w)}/{f}")
+            for b in plan(w).blocks
+            for f in (
+                "pieces.parquet",
+                "links.parquet",
+                "seams.npz",
+                "corners.parquet",
+            )
+        ],
+    output:
+        sections="results/{scene}/stitched/sections.parquet",
+        corners="results/{scene}/stitched/corners.parquet",
+    log:
+        "results/{scene}/logs/stitch.log",
+    params:
+        signature=signature("stitch"),
+        tiling=lambda w: plan(w).tiling,
+        tolerance=lambda w: plan(w).tolerance,
+        folders=lambda w: [
+            f"results/{w.scene}/blocks/{b.name}/{source(w)}" for b in plan(w).blocks
+        ],
+    shell:
+        "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
+        " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"
+        " --folders {params.folders:q} --sections {output.sections:q} --corners {output.corners:q} > {log:q} 2>&1"

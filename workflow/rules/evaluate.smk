@@ -1,0 +1,23 @@
+# Comparison with truth, where a scene has it.
+
+
+rule evaluation:
+    """Metrics of labels, heights and sections against the truth."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        truth=ancient("results/{scene}/truth.parquet"),
+        labels=ancient("results/{scene}/labels.tif"),
+        heights=ancient("results/{scene}/heights.tif"),
+        sections=ancient("results/{scene}/buildings.parquet"),
+    output:
+        evaluation="results/{scene}/evaluation.json",
+        picture="results/{scene}/evaluation.png",
+    log:
+        "results/{scene}/logs/evaluation.log",
+    params:
+        signature=signature("evaluate"),
+        fallback=lambda w: plan(w).models["corners"].contract["heights"]["fallback"],
+    shell:
+        "python -m kibs_steps.evaluate --scene {input.scene:q} --truth {input.truth:q} --labels {input.labels:q}"
+        " --heights {input.heights:q} --sections {input.sections:q} --fallback-height {params.fallback}"
+        " --out {output.evaluation:q} --picture {output.picture:q} > {log:q} 2>&1"

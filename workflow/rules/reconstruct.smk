@@ -1,0 +1,106 @@
+# From sections and corners to planes, to where roofs stand, to buildings and solids.
+
+
+rule planes:
+    """Fit a plane to every section of one block."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        dtm=ancient("results/{scene}/dtm.tif"),
+        sections=ancient("results/{scene}/stitched/sections.parquet"),
+        corners=ancient("results/{scene}/stitched/corners.parquet"),
+        model=ancient("results/{scene}/models/corners.json"),
+    output:
+        planes="results/{scene}/blocks/{block}/planes.parquet",
+        filed="results/{scene}/blocks/{block}/filed_corners.parquet",
+    log:
+        "results/{scene}/logs/planes/{block}.log",
+    params:
+        signature=signature("planes"),
+        reach=lambda w: plan(w).reach,
+        rule=lambda w: plan(w).settings["planes"],
+    shell:
+        "python -m kibs_steps.planes --scene {input.scene:q} --sections {input.sections:q} --corners {input.corners:q}"
+        " --model {input.model:q} --name {wildcards.block} --reach {params.reach} --rule {params.rule}"
+        " --planes {output.planes:q} --filed {output.filed:q} > {log:q} 2>&1"
+
+
+rule ground:
+    """Move the sections of one block to where they stand."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        dtm=ancient("results/{scene}/dtm.tif"),
+        planes=ancient("results/{scene}/blocks/{block}/planes.parquet"),
+    output:
+        "results/{scene}/blocks/{block}/ground.parquet",
+    log:
+        "results/{scene}/logs/ground/{block}.log",
+    params:
+        signature=signature("planes"),
+    shell:
+        "python -m kibs_steps.ground --scene {input.scene:q} --planes {input.planes:q} --out {output:q} > {log:q} 2>&1"
+
+
+rule buildings:
+    """Group the sections of all blocks to buildings."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        ground=blocks("ground.parquet"),
+        footprints=lambda w: (
+            ancient(plan(w).settings["footprints"])
+            if "footprints" in plan(w).settings
+            else []
+        ),
+    output:
+        "results/{scene}/buildings.parquet",
+    log:
+        "results/{scene}/logs/buildings.log",
+    params:
+        signature=signature("buildings"),
+        tiling=lambda w: plan(w).tiling,
+        options=options("footprints"),
+    shell:
+        "python -m kibs_steps.buildings --scene {input.scene:q} --tile {params.tiling.tile}"
+        " --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
+        " --ground {input.ground:q} --out {output:q} > {log:q} 2>&1"
+
+
+rule solids:
+    """Build valid solids of the buildings of one block."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        dtm=ancient("results/{scene}/dtm.tif"),
+        buildings=ancient("results/{scene}/buildings.parquet"),
+    output:
+        solids="results/{scene}/blocks/{block}/solids.city.jsonl",
+        attributes="results/{scene}/blocks/{block}/solids.parquet",
+    log:
+        "results/{scene}/logs/solids/{block}.log",
+    params:
+        signature=signature("solids"),
+        options=options("lod_label"),
+    shell:
+        "python -m kibs_steps.solids --scene {input.scene:q} --buildings {input.buildings:q} --name {wildcards.block}"
+        " {params.options:q} --out {output.solids:q} --attributes {output.attributes:q} > {log:q} 2>&1"
+
+
+def kept(p):
+    """The files of every block that stay on disk: one that is missing is made again."""
+    detected = (
+        ["fed/corners.parquet"]
+        if p.settings["feed"] == "truth"
+        else [
+            "tiles.tif",
+            "sections.tif",
+            "detected/pieces.parquet",
+            "detected/corners.parquet",
+        ]
+    )
+    files = [
+        *detected,
+        "planes.parquet",
+        "filed_corners.parquet",
+        "ground.parquet",
+        "solids.parquet",
+        "solids.city.jsonl",
+    ]
+    return [f"results/{p.name}/blocks/{b.name}/{f}" for b in p.blocks for f in files]

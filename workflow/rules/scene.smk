@@ -1,0 +1,86 @@
+# From the raster and the terrain to facts checked once, and the image of every block on the models' grid.
+
+
+rule simulated:
+    """Make a scene with exact truth at the configured view and sun."""
+    output:
+        raster="results/{scene}/simulated/scene.tif",
+        dtm="results/{scene}/simulated/dtm.tif",
+        truth="results/{scene}/simulated/truth.gpkg",
+    log:
+        "results/{scene}/logs/simulated.log",
+    params:
+        signature=signature("source"),
+        options=options(
+            "view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"
+        ),
+        simulate=lambda w: [
+            f"--{k.replace('_', '-')}={v}"
+            for k, v in plan(w).settings["simulate"].items()
+        ],
+    shell:
+        "python -m kibs_steps.simulate.scene {params.simulate:q} {params.options:q}"
+        " --out $(dirname {output.raster:q}) > {log:q} 2>&1"
+
+
+rule scene:
+    """Check the raster and the terrain once, and write what every later step needs to know."""
+    input:
+        raster=lambda w: ancient(plan(w).raster),
+        dtm=lambda w: ancient(plan(w).dtm) if not is_number(plan(w).dtm) else [],
+    output:
+        scene="results/{scene}/scene.json",
+        dtm="results/{scene}/dtm.tif",
+    log:
+        "results/{scene}/logs/scene.log",
+    params:
+        signature=signature("scene"),
+        gsd=lambda w: plan(w).models["sections"].contract["gsd"],
+        dtm=lambda w: plan(w).dtm,
+        options=options(
+            "view_azimuth",
+            "view_elevation",
+            "sun_azimuth",
+            "sun_elevation",
+            "projection_height",
+            "bands",
+            "aoi",
+            "vertical_crs",
+        ),
+    shell:
+        "python -m kibs_steps.scene --name {wildcards.scene:q} --raster {input.raster:q} --dtm={params.dtm:q}"
+        " --gsd {params.gsd} {params.options:q} --out {output.scene:q} > {log:q} 2>&1"
+
+
+rule tiles:
+    """The image of one block on the models' grid, margins included."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        raster=lambda w: ancient(plan(w).raster),
+    output:
+        "results/{scene}/blocks/{block}/tiles.tif",
+    log:
+        "results/{scene}/logs/tiles/{block}.log",
+    params:
+        signature=signature("tiles"),
+        tiling=lambda w: plan(w).tiling,
+    shell:
+        "python -m kibs_steps.tiles --scene {input.scene:q} --name {wildcards.block} --tile {params.tiling.tile}"
+        " --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
+
+
+rule model:
+    """Check a model's contract and angles, and write its hash down."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        model=lambda w: ancient(str(plan(w).models[w.task].path)),
+    output:
+        "results/{scene}/models/{task}.json",
+    log:
+        "results/{scene}/logs/model_{task}.log",
+    params:
+        signature=signature("model_{task}"),
+        allow=lambda w: ["--allow-angles"] if plan(w).settings["allow_angles"] else [],
+    shell:
+        "python -m kibs_steps.models.contract {input.model:q} --task {wildcards.task} --scene {input.scene:q}"
+        " {params.allow:q} --out {output:q} > {log:q} 2>&1"
