@@ -1,0 +1,426 @@
+"""Training tiles from three sources, and what may be done to them without making them untrue.
+
+A `Sample` is one tile with its truth, also partial truth (docs/architecture.md, "Training samples"). Sources: the simulator
+(exact truth), roof-graph photographs pasted into other ground (real roofs, sections and corners known, heights not), chips
+with building masks (real scenes of many places, roofs known, sections not). In: files below a data folder. Out: samples.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from kibs_steps.errors import KibsError
+
+GSD = 0.38  # m per px of the models trained here
+GRAPH_GSD = 0.06  # m per px, about, of the roof-graph photographs
+REDUCED = 3  # they are kept in memory this many times smaller
+UNKNOWN = 255
+NADIR = np.array([0, 0, 0, 0, 1, 0], np.float32)
+# Folders of chips with the GSD (m) their houses suggest; the WHU city chips are of many resolutions.
+CHIPS = {"inria": 0.3, "spacenet": 0.3, "whu_east_asia": 0.3, "nzlnd": 0.4, "whu_sample": 0.6}
+
+
+class NoTrainingData(KibsError):
+    """A data folder lacks what training needs."""
+
+
+class Sample(NamedTuple):
+    """One tile (s, s) with its truth; see docs/architecture.md, "Training samples"."""
+
+    rgb: np.ndarray
+    labels: np.ndarray
+    roof: np.ndarray
+    height: np.ndarray
+    corners: np.ndarray
+    corner_heights: np.ndarray
+    corners_known: np.ndarray
+    geometry: np.ndarray
+
+
+class RoofGraph(NamedTuple):
+    """One photographed house: rgb uint8 (h, w, 3) at `scale` of the original, vertices (n, 2) px of it (col, row), faces."""
+
+    name: str
+    rgb: np.ndarray
+    vertices: np.ndarray
+    faces: list[np.ndarray]
+
+
+class Chip(NamedTuple):
+    """rgb uint8 (h, w, 3), building mask bool (h, w), m per px."""
+
+    name: str
+    rgb: np.ndarray
+    building: np.ndarray
+    gsd: float
+
+
+def read_roof_graphs(source: str | Path) -> list[RoofGraph]:
+    """Roof graphs of the Roof-graph data set (Ren et al. 2021) from its tar file or the folder it was extracted to.
+
+    Photographs are made REDUCED times smaller. Raises `NoTrainingData` if none is there.
+    """
+    files = _files(Path(source), ("dt_roof_image/", "res_roof_graph/"))
+    graphs = []
+    for path in sorted(p for p in files if p.startswith("dt_roof_image/")):
+        name = Path(path).stem
+        faces, vertices = (files.get(f"res_roof_graph/{name}.{end}") for end in ("faces", "verts"))
+        if faces is None or vertices is None:
+            continue
+        rgb = cv2.imdecode(np.frombuffer(files[path], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        rows, cols = rgb.shape[0] // REDUCED, rgb.shape[1] // REDUCED
+        small = cv2.resize(rgb[: rows * REDUCED, : cols * REDUCED], (cols, rows), interpolation=cv2.INTER_AREA)
+        points = np.array([line.split(",") for line in vertices.decode().split()], float).reshape(-1, 2) / REDUCED
+        rings = [np.array(line.split(",")[:-1], int) for line in faces.decode().split()]
+        graphs.append(RoofGraph(name, small, points, [ring for ring in rings if len(ring) >= 3]))
+    if not graphs:
+        raise NoTrainingData(
+            f"{source} holds no roof graphs: give the folder or tar with dt_roof_image/, res_roof_graph/"
+        )
+    return graphs
+
+
+def _files(source: Path, wanted: tuple[str, ...]) -> dict[str, bytes]:
+    """Content by path of the wanted folders' files, of a tar or a folder."""
+    if source.is_dir():
+        return {f"{d}{p.name}": p.read_bytes() for d in wanted for p in sorted((source / d).glob("*"))}
+    if not source.is_file():
+        raise NoTrainingData(f"{source} is not there: name the data folder with roofgraph/roofgraph.tar")
+    with tarfile.open(source) as tar:
+        members = ((m.name.removeprefix("./"), m) for m in tar if m.isfile())
+        return {name: tar.extractfile(m).read() for name, m in members if name.startswith(wanted)}
+
+
+def held_out(graph: RoofGraph, share: float = 0.15) -> bool:
+    """Whether a photograph is kept for validation: by its map sheet, so that neighbours stay together."""
+    sheet = graph.name.rsplit("_", 1)[0]
+    return (sum(ord(c) * 31**i for i, c in enumerate(sheet)) * 2654435761) % 2**32 < share * 2**32
+
+
+def read_chips(folder: str | Path) -> list[Chip]:
+    """Chips that come with a building mask, of the folders in CHIPS. Raises `NoTrainingData` if there are none."""
+    chips = []
+    for place, gsd in CHIPS.items():
+        root = Path(folder) / place
+        pairs = [(root / "images" / p.name, p) for p in sorted((root / "gt").glob("*.png"))]
+        pairs += [(p.with_name(p.name.replace("_gt", "")), p) for p in sorted(root.glob("*_gt.png"))]
+        for image, mask in pairs:
+            rgb = cv2.imread(str(image), cv2.IMREAD_COLOR)[..., ::-1]
+            chips.append(Chip(f"{place}/{image.stem}", rgb, cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) > 127, gsd))
+    if not chips:
+        raise NoTrainingData(f"no chips with building masks below {folder}")
+    return chips
+
+
+def empty(rgb: np.ndarray) -> Sample:
+    """A sample of ground: no roofs, nothing unknown."""
+    size = rgb.shape[:2]
+    return Sample(
+        rgb,
+        np.zeros(size, np.int32),
+        np.zeros(size, np.uint8),
+        np.full(size, np.nan, np.float32),
+        np.zeros((0, 2), np.float32),
+        np.zeros(0, np.float32),
+        np.ones(size, np.uint8),
+        np.zeros(6, np.float32),
+    )
+
+
+def simulated(
+    rng: np.random.Generator,
+    size: int = 256,
+    backgrounds: Sequence[np.ndarray] | None = None,
+    view_elevation: tuple[float, float] = (50.0, 90.0),
+) -> Sample:
+    """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere."""
+    from kibs_steps.simulate.scene import random_scene
+
+    gsd = GSD * rng.uniform(0.9, 1.1)
+    rendering, geometry = random_scene(rng, size=size, gsd=gsd, view_elevation=view_elevation, backgrounds=backgrounds)
+    section = rendering.section.astype(np.int32)
+    return Sample(
+        rendering.rgb,
+        section,
+        (section > 0).astype(np.uint8),
+        rendering.height.astype(np.float32),
+        rendering.corners.astype(np.float32).reshape(-1, 2),
+        rendering.corner_heights.astype(np.float32),
+        np.ones(section.shape, np.uint8),
+        np.asarray(geometry, np.float32).reshape(6),
+    )
+
+
+def chip_sample(chip: Chip, rng: np.random.Generator, size: int) -> Sample:
+    """A window of a chip, turned and scaled at random: roofs known, sections and corners not."""
+    scale = chip.gsd / GSD * rng.uniform(0.75, 1.35)
+    angle = rng.uniform(0, 2 * np.pi)
+    linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    if rng.random() < 0.5:
+        linear = linear @ np.diag([-1.0, 1.0])
+    rows, cols = chip.building.shape
+    reach = 0.35 * size / scale  # keep most of the window on the chip, the rest is mirrored
+    centre = [rng.uniform(min(reach, n / 2), max(n - reach, n / 2)) for n in (cols, rows)]
+    affine = np.hstack([linear, (size / 2 - linear @ centre)[:, None]])
+    blur = 0.4 / scale if scale < 0.8 else 0.0
+    rgb = cv2.GaussianBlur(chip.rgb, (0, 0), blur) if blur else chip.rgb
+    rgb = cv2.warpAffine(rgb, affine, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    mask = chip.building.astype(np.uint8) * 255
+    mask = cv2.warpAffine(mask, affine, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    building = mask > 127
+    sample = empty(rgb)
+    return sample._replace(
+        labels=np.where(building, -1, 0).astype(np.int32),
+        roof=building.astype(np.uint8),
+        # A mask's outline is only as good as its annotator: no corners within 3 px of a building are learned either way.
+        corners_known=(cv2.dilate(mask, np.ones((7, 7))) <= 127).astype(np.uint8),
+        geometry=NADIR.copy() if rng.random() < 0.4 else sample.geometry,
+    )
+
+
+def with_decoys(sample: Sample, other: Sample, rng: np.random.Generator) -> Sample:
+    """Patches of `other`'s ground, cut like houses, laid on `sample`'s ground: a cut-out's outline alone is no house."""
+    rgb = sample.rgb.copy()
+    size = rgb.shape[0]
+    for _ in range(rng.integers(1, 5)):
+        box = (rng.random(2) * size, rng.uniform(15, 70, 2), rng.uniform(0, 180))
+        patch = cv2.fillPoly(np.zeros((size, size), np.uint8), [cv2.boxPoints(box).astype(np.int32)], 1)
+        patch[(sample.roof != 0) | (other.roof != 0)] = 0
+        alpha = _feathered(patch, rng.uniform(0, 3))[..., None]
+        rgb = (alpha * other.rgb + (1 - alpha) * rgb).astype(np.uint8)
+    return sample._replace(rgb=rgb)
+
+
+def pasted_houses(
+    ground: Sample, graphs: Sequence[RoofGraph], rng: np.random.Generator, count: tuple[int, int] = (5, 13)
+) -> Sample:
+    """Photographed houses pasted into a tile: sections and corners known, heights not.
+
+    Each comes with some of its own surroundings, softly at random, so that the seam tells nothing. A ring round the annotated
+    roof is ground for certain; the rest of the pasted surroundings is unknown.
+    """
+    size = ground.rgb.shape[0]
+    rgb = ground.rgb.copy()
+    labels, roof, known = ground.labels.copy(), ground.roof.copy(), ground.corners_known.copy()
+    taken = np.zeros((size, size), np.uint8)
+    corners: list[np.ndarray] = []
+    label = max(int(labels.max()), 0)
+    for _ in range(rng.integers(count[0], count[1] + 1)):
+        graph = graphs[rng.integers(len(graphs))]
+        affine = _house_affine(graph, rng, size)
+        vertices = graph.vertices @ affine[:, :2].T + affine[:, 2]
+        own = np.zeros((size, size), np.int32)
+        for i, face in enumerate(graph.faces, start=1):
+            cv2.fillPoly(own, [np.round((vertices[face] - 0.5) * 16).astype(np.int32)], i, shift=4)
+        house = (own > 0).astype(np.uint8)
+        if not house.any() or (taken & cv2.dilate(house, np.ones((5, 5), np.uint8))).any():
+            continue
+        ring = cv2.dilate(house, np.ones((9, 9), np.uint8))
+        reach = int(rng.integers(4, 16))
+        near = cv2.dilate(house, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2))
+        inside = cv2.warpAffine(
+            np.ones(graph.rgb.shape[:2], np.uint8), _centred(affine), (size, size), flags=cv2.INTER_NEAREST
+        )
+        alpha = _feathered(near & inside & (1 - taken), rng.uniform(0.3, 4))
+        alpha = np.maximum(alpha, house)
+        alpha[(taken > 0) | (inside == 0)] = 0
+        picture = cv2.warpAffine(cv2.GaussianBlur(graph.rgb, (0, 0), 0.6), _centred(affine), (size, size))
+        gain = np.exp(rng.normal(0, 0.12) + rng.normal(0, 0.06, 3))
+        picture = np.clip(picture * gain, 0, 255)
+        rgb = (alpha[..., None] * picture + (1 - alpha[..., None]) * rgb).astype(np.uint8)
+        changed = alpha > 0.15
+        labels[changed], roof[changed], known[changed] = -1, UNKNOWN, 0
+        # The ring counts as ground only where the photograph is really shown: elsewhere the old ground keeps its truth.
+        sure = (ring > 0) & changed
+        labels[sure], roof[sure], known[sure] = 0, 0, 1
+        seen = (house > 0) & (inside > 0)
+        labels[seen], roof[seen], known[seen] = own[seen] + label, 1, 1
+        label = max(int(labels.max()), label)
+        taken |= ring & inside
+        corners.append(vertices[np.unique(np.concatenate(graph.faces))])
+    points = np.concatenate(corners).astype(np.float32) if corners else np.zeros((0, 2), np.float32)
+    points = points[(points >= 0).all(1) & (points < size).all(1)]
+    return ground._replace(
+        rgb=rgb,
+        labels=labels,
+        roof=roof,
+        corners=np.concatenate([ground.corners, points]),
+        corner_heights=np.concatenate([ground.corner_heights, np.full(len(points), np.nan, np.float32)]),
+        corners_known=known,
+    )
+
+
+def _house_affine(graph: RoofGraph, rng: np.random.Generator, size: int) -> np.ndarray:
+    """Tile px of the reduced photograph's px, (2, 3): the house anywhere in the tile, turned, scaled, perhaps mirrored."""
+    scale = REDUCED * GRAPH_GSD / GSD * rng.uniform(0.85, 1.3)
+    angle = rng.uniform(0, 2 * np.pi)
+    linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    if rng.random() < 0.5:
+        linear = linear @ np.diag([-1.0, 1.0])
+    place = rng.uniform(0, size, 2) - linear @ graph.vertices.mean(0)
+    return np.hstack([linear, place[:, None]])
+
+
+def _centred(affine: np.ndarray) -> np.ndarray:
+    """The same map between pixel indices (centres at whole numbers) as OpenCV counts them."""
+    return np.hstack([affine[:, :2], (affine[:, 2] + affine[:, :2] @ [0.5, 0.5] - 0.5)[:, None]])
+
+
+def _feathered(mask: np.ndarray, softness: float) -> np.ndarray:
+    """A mask's blending weight, float32 0–1, falling off inside it over about `softness` px."""
+    inner = cv2.distanceTransform(mask, cv2.DIST_L2, 3)
+    return np.clip(inner / (2 * softness + 1e-3), 0, 1).astype(np.float32)
+
+
+def dihedral(sample: Sample, k: int) -> Sample:
+    """The sample mirrored (k ≥ 4: columns reversed first) and turned by k % 4 quarter turns counter-clockwise.
+
+    Positions and the geometry's displacement vectors turn with the image.
+    """
+    turns = k % 4
+    size = sample.rgb.shape[0]
+
+    def image(a: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(a[:, ::-1] if k >= 4 else a, turns))
+
+    corners = sample.corners.copy()
+    vectors = sample.geometry[:4].reshape(2, 2).copy()
+    if k >= 4:
+        corners[:, 0] = size - corners[:, 0]
+        vectors[:, 0] = -vectors[:, 0]
+    for _ in range(turns):
+        corners = np.stack([corners[:, 1], size - corners[:, 0]], axis=1)
+        vectors = np.stack([vectors[:, 1], -vectors[:, 0]], axis=1)
+    return Sample(
+        *(image(a) for a in sample[:4]),
+        corners,
+        sample.corner_heights,
+        image(sample.corners_known),
+        np.concatenate([vectors.ravel(), sample.geometry[4:]]).astype(np.float32),
+    )
+
+
+def window(sample: Sample, row: int, col: int, size: int) -> Sample:
+    """The part of a sample from (row, col), `size` px wide and high."""
+    part = (slice(row, row + size), slice(col, col + size))
+    corners = sample.corners - np.float32([col, row])
+    inside = (corners >= 0).all(1) & (corners < size).all(1)
+    return Sample(
+        *(a[part] for a in sample[:4]),
+        corners[inside],
+        sample.corner_heights[inside],
+        sample.corners_known[part],
+        sample.geometry,
+    )
+
+
+def without_geometry(sample: Sample, rng: np.random.Generator, share: float = 0.3) -> Sample:
+    """Forgets now the view, now the sun, so that a network learns to do without."""
+    geometry = sample.geometry.copy()
+    for vector, flag in ((slice(0, 2), 4), (slice(2, 4), 5)):
+        if rng.random() < share:
+            geometry[vector] = 0
+            geometry[flag] = 0
+    return sample._replace(geometry=geometry)
+
+
+def radiometry(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Another sensor, stretch and weather over the same scene, uint8 (h, w, 3)."""
+    x = rgb.astype(np.float32) / 255
+    rows, cols = rgb.shape[:2]
+    if rng.random() < 0.5:  # coarser pixels drawn larger, as pansharpened and resampled imagery is
+        factor = rng.uniform(1.0, 2.2)
+        small = cv2.resize(x, (round(cols / factor), round(rows / factor)), interpolation=cv2.INTER_AREA)
+        x = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC if rng.random() < 0.5 else cv2.INTER_LINEAR)
+    if rng.random() < 0.35:
+        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 1.4))
+    if rng.random() < 0.25:  # colours coarser than brightness, as after pansharpening
+        grey = x.mean(2, keepdims=True)
+        x = grey + cv2.GaussianBlur(x - grey, (0, 0), rng.uniform(0.8, 2.5))
+    if rng.random() < 0.25:  # sharpened by the vendor
+        x = x + rng.uniform(0.2, 1.0) * (x - cv2.GaussianBlur(x, (0, 0), 1.0))
+    grey = x.mean(2, keepdims=True)
+    saturation = rng.uniform(0.0, 0.4) if rng.random() < 0.12 else np.exp(rng.normal(0, 0.3))
+    x = grey + saturation * (x - grey)
+    if rng.random() < 0.4:  # hue: mix the bands a little
+        mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
+        x = x @ (mix / mix.sum(1, keepdims=True)).T.astype(np.float32)
+    x = x * np.exp(rng.normal(0, 0.1, 3)).astype(np.float32)
+    low, high = np.percentile(x[::4, ::4], [1, 99])
+    if rng.random() < 0.5 and high > low + 0.05:  # stretched to its own range, as rasters for viewing are
+        x = (x - low) / (high - low) * rng.uniform(0.7, 1.05) + rng.uniform(-0.03, 0.12)
+    x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, 0.35))
+    x = 0.5 + np.exp(rng.normal(0, 0.2)) * (x - 0.5) + rng.normal(0, 0.07)
+    if rng.random() < 0.2:  # haze
+        veil = rng.uniform(0.05, 0.35)
+        x = (1 - veil) * x + veil * rng.uniform(0.6, 0.9, 3)
+    if rng.random() < 0.6:
+        x = x + rng.normal(0, rng.uniform(0.003, 0.035), x.shape)
+    out = (np.clip(x, 0, 1) * 255).astype(np.uint8)
+    if rng.random() < 0.25:
+        coded = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 95))])[1]
+        out = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(out, dtype=np.uint8)
+
+
+def save(path: str | Path, sample: Sample) -> None:
+    """Keep a sample in one compressed file."""
+    from kibs_steps import store
+
+    with store.whole(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **sample._asdict())
+
+
+def load(path: str | Path) -> Sample:
+    """Read a kept sample."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return Sample(**{name: arrays[name] for name in Sample._fields})
+
+
+class Mixture:
+    """Endless tiles for one task, the i-th always drawn with the same random numbers.
+
+    `shares` are the probabilities of (simulated, pasted houses, chips). Simulated tiles come from `pool`, a folder of kept
+    samples that another process may still be filling; while it is empty, the real sources stand in.
+    """
+
+    def __init__(
+        self,
+        pool: Path,
+        graphs: Sequence[RoofGraph],
+        chips: Sequence[Chip],
+        shares: tuple[float, float, float],
+        size: int,
+        seed: int,
+    ):
+        self.pool, self.graphs, self.chips = pool, graphs, chips
+        self.shares, self.size, self.seed = shares, size, seed
+        self._kept: list[Path] = []
+        self._listed_at = -1
+
+    def __getitem__(self, index: int) -> Sample:
+        rng = np.random.default_rng([self.seed, index])
+        if self._listed_at < 0 or index - self._listed_at > 500:
+            self._kept = sorted(self.pool.glob("*.npz"))
+            self._listed_at = index
+        shares = np.array(self.shares) * [bool(self._kept), bool(self.graphs), bool(self.chips)]
+        source = rng.choice(3, p=shares / shares.sum())
+        if source == 0:
+            sample = load(self._kept[rng.integers(len(self._kept))])
+            row, col = rng.integers(0, [n - self.size + 1 for n in sample.labels.shape])
+            sample = window(sample, row, col, self.size)
+        else:
+            sample = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size)
+            if rng.random() < 0.5:
+                other = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size)
+                sample = with_decoys(sample, other, rng)
+            if source == 1:
+                sample = pasted_houses(sample, self.graphs, rng)
+        sample = without_geometry(dihedral(sample, int(rng.integers(8))), rng)
+        return sample._replace(rgb=radiometry(sample.rgb, rng))

@@ -1,0 +1,130 @@
+"""A trained checkpoint to an ONNX file that carries its contract.
+
+In: `checkpoint.pt` of `learn.training`. Out: `{task}.onnx`, opset 17, one tile (1, 3, s, s) a call, with the averaged weights and
+`metadata_props["kibs"]` (models/contract.schema.json).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from kibs_steps import cli, store
+from kibs_steps.learn import dataset, training
+from kibs_steps.learn.architectures import OUTPUTS, Dense
+from kibs_steps.models import contract as contracts
+
+TILE, MARGIN = 256, 16
+THRESHOLDS = {
+    "sections": {"roof": 0.5, "marker": 0.5, "distance_clip": training.DISTANCE_CLIP, "min_area": 12},
+    "corners": {"corner": 0.3, "corner_radius": 7.5},
+}
+LICENCE = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
+
+
+def contract_of(task: str, heights: tuple[float, float] | None = None, **facts: Any) -> dict[str, Any]:
+    """The contract of a network trained here.
+
+    `heights` are mean and standard deviation (m) of the training set's corners; `facts` replace or add fields of the
+    contract: `thresholds` (merged), `seed`, `commit`, `metrics`.
+    """
+    contract: dict[str, Any] = {
+        "contract": 1,
+        "task": task,
+        "head": "dense",
+        "gsd": dataset.GSD,
+        "tile": TILE,
+        "margin": MARGIN,
+        "input": {"channels": "RGB", "scale": 1.0, "mean": [127.0] * 3, "std": [128.0] * 3},
+        "geometry_input": True,
+        "thresholds": {**THRESHOLDS[task], **facts.get("thresholds", {})},
+        "trained_on": {
+            "view_elevation": [50, 90],
+            "view_azimuth": [0, 360],
+            "sun_elevation": [20, 70],
+            "sun_azimuth": [0, 360],
+            "data": [
+                "simulated scenes",
+                "roof-graph photographs (Ren et al. 2021), pasted",
+                "chips with building masks",
+            ],
+            "licence": LICENCE,
+        },
+    }
+    contract["trained_on"].update({k: facts[k] for k in ("seed", "commit") if k in facts})
+    if task == "corners":
+        mean, sigma = heights or (6.0, 4.0)
+        contract["blend"] = training.BLEND
+        contract["heights"] = {
+            "edges": training.EDGES.tolist(),
+            "centres": training.CENTRES.tolist(),
+            "fallback": round(mean, 2),
+            "fallback_sigma": round(sigma, 2),
+        }
+    if "metrics" in facts:
+        contract["metrics"] = facts["metrics"]
+    return contracts.validate(contract, "the new contract")
+
+
+def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float]:
+    """Mean and standard deviation (m) of the corners' heights in the first kept tiles of a pool."""
+    heights = [dataset.load(path).corner_heights for path in sorted(pool.glob("*.npz"))[:most]]
+    known = np.concatenate(heights)
+    known = known[np.isfinite(known)]
+    return float(known.mean()), float(known.std())
+
+
+def export(model: Dense, path: str | Path, contract: dict[str, Any]) -> None:
+    """Write a network as ONNX with its contract; the input's side is the contract's tile."""
+    import onnx
+
+    tile = contract["tile"]
+    example = (torch.zeros(1, 3, tile, tile), torch.zeros(1, 6))
+    model = model.eval().to(memory_format=torch.contiguous_format)
+    with store.whole(path) as temporary:
+        torch.onnx.export(
+            model,
+            example,
+            str(temporary),
+            input_names=["image", "geometry"],
+            output_names=list(OUTPUTS[model.task]),
+            opset_version=17,
+            dynamo=False,
+        )
+        proto = onnx.load(str(temporary))
+        onnx.helper.set_model_props(proto, {contracts.KEY: json.dumps(contract)})
+        onnx.checker.check_model(proto)
+        onnx.save(proto, str(temporary))
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Export the averaged weights of a run."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.export", description=main.__doc__)
+    parser.add_argument("--checkpoint", required=True)
+    parser.add_argument("--out", required=True, help="ONNX file")
+    parser.add_argument("--pool", help="simulated tiles, for the mean corner height")
+    parser.add_argument("--thresholds", type=json.loads, default={}, help="JSON, replaces thresholds of the contract")
+    parser.add_argument("--metrics", help="report of learn.validation, kept in the contract")
+    parser.add_argument("--commit", help="commit of the training code")
+    args = parser.parse_args(argv)
+    state = torch.load(args.checkpoint, weights_only=True, map_location="cpu")
+    task = state["settings"]["task"]
+    model = training.network(task)
+    model.load_state_dict(state["average"])
+    facts: dict[str, Any] = {"thresholds": args.thresholds, "seed": state["settings"]["seed"]}
+    if args.commit:
+        facts["commit"] = args.commit
+    if args.metrics:
+        facts["metrics"] = store.read_json(args.metrics)
+    heights = corner_height_moments(Path(args.pool)) if args.pool and task == "corners" else None
+    export(model, args.out, contract_of(task, heights, **facts))
+    print(f"{args.out}: {state['step']} steps, {state['seconds'] / 60:.0f} min")
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,262 @@
+"""How good a pair of models is on scenes it was not trained on: roofs, sections, corners and their heights.
+
+In: ONNX models and validation samples (simulated scenes of fixed seeds, held-out roof photographs, real village scenes).
+Out: a report by test set, and pictures to look at. Decoding is the product's own (`models.heads`).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from kibs_steps import cli, store
+from kibs_steps.blend import blend, rims
+from kibs_steps.learn import dataset
+from kibs_steps.models import contract as contracts
+from kibs_steps.models import heads, runtime
+
+SMALLEST = 12  # px: smaller true sections are neither asked for nor held against a model
+
+
+class Match(NamedTuple):
+    """Detections of many tiles: scores (n,), whether each matches a section not taken before; number of true sections."""
+
+    scores: np.ndarray
+    hits: np.ndarray
+    truths: int
+
+
+def matches(found: np.ndarray, scores: np.ndarray, truth: np.ndarray, overlap: float = 0.5) -> Match:
+    """Detections (labels 1…n with scores) against true labels of one tile, best scores first.
+
+    A detection lying mostly on unknown ground (−1) or on sections too small to ask for is left out.
+    """
+    area = np.bincount(np.maximum(truth, 0).ravel())
+    small = np.isin(truth, np.flatnonzero(area < SMALLEST)) & (truth > 0)
+    unknown = (truth < 0) | small
+    asked = np.where(unknown, 0, truth)
+    wanted, inverse = np.unique(asked, return_inverse=True)
+    index = inverse.reshape(asked.shape)
+    n = int(found.max(initial=0))
+    joint = np.zeros((n + 1, len(wanted)))
+    np.add.at(joint, (found.ravel(), index.ravel()), 1)
+    size = joint.sum(1)
+    off = np.bincount(found.ravel(), unknown.ravel(), n + 1)
+    union = size[:, None] + joint.sum(0)[None] - joint
+    iou = np.where(wanted[None] > 0, joint / np.maximum(union, 1), 0.0)
+    taken = np.zeros(len(wanted), bool)
+    judged, hits = [], []
+    for label in sorted(range(1, n + 1), key=lambda i: (-scores[i - 1], i)):
+        free = np.where(taken, 0.0, iou[label])
+        best = int(free.argmax())
+        hit = free[best] >= overlap
+        if not hit and off[label] > 0.5 * size[label]:
+            continue
+        taken[best] |= hit
+        judged.append(scores[label - 1])
+        hits.append(hit)
+    return Match(np.array(judged), np.array(hits, bool), int((wanted > 0).sum()))
+
+
+def average_precision(results: Iterable[Match]) -> float:
+    """Area under the precision–recall curve of all tiles together (precision made non-increasing)."""
+    results = list(results)
+    truths = sum(r.truths for r in results)
+    scores = np.concatenate([r.scores for r in results])
+    hits = np.concatenate([r.hits for r in results])[np.argsort(-scores, kind="stable")]
+    if not truths or not hits.size:
+        return 0.0
+    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
+    precision = np.maximum.accumulate(precision[::-1])[::-1]
+    return float((precision * hits).sum() / truths)
+
+
+def roof_iou(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
+    """IoU of found (bool) and true (0, 1, 255 unknown) roof pixels over all tiles."""
+    both = either = 0
+    for found, truth in pairs:
+        known, true = truth != dataset.UNKNOWN, truth == 1
+        both += (found & true & known).sum()
+        either += ((found | true) & known).sum()
+    return float(both / max(either, 1))
+
+
+def village(folder: str | Path, size: int) -> list[dataset.Sample]:
+    """The real village scenes at the models' GSD, mirrored at the border to (size, size); the rim beyond is unknown.
+
+    Connected areas of one slope orientation are sections; roof without an orientation has unknown sections.
+    """
+    samples = []
+    for path in sorted(Path(folder).glob("*_labels.png")):
+        image = next(p for p in Path(folder).glob(path.name.replace("_labels.png", "_rgb.*")))
+        rgb = cv2.imread(str(image), cv2.IMREAD_COLOR)[..., ::-1]
+        marked = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        orientation, roof = (marked, marked > 0) if marked.ndim == 2 else (marked[..., 1], marked[..., 2] > 0)
+        side = round(rgb.shape[0] * 0.1 / dataset.GSD)
+        small = cv2.resize(rgb, (side, side), interpolation=cv2.INTER_AREA)
+        slope = cv2.resize(orientation, (side, side), interpolation=cv2.INTER_NEAREST)
+        roof = cv2.resize(roof.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST)
+        labels = -roof.astype(np.int32)
+        for value in np.unique(slope[slope > 0]):
+            part, _ = ndimage.label(slope == value)
+            labels[part > 0] = part[part > 0] + max(labels.max(), 0)
+        before = (size - side) // 2
+        around = (before, size - side - before)
+        mirrored = np.pad(small, (around, around, (0, 0)), mode="symmetric")
+        sample = dataset.empty(mirrored)
+        samples.append(
+            sample._replace(
+                labels=np.pad(labels, around, constant_values=-1),
+                roof=np.pad((labels != 0).astype(np.uint8), around, constant_values=dataset.UNKNOWN),
+                geometry=dataset.NADIR.copy(),
+                corners_known=np.zeros((size, size), np.uint8),
+            )
+        )
+    return samples
+
+
+def simulated(count: int, size: int, view_elevation: tuple[float, float]) -> list[dataset.Sample]:
+    """Simulated scenes of seeds no training uses, seen from the elevations (deg) given."""
+    return [
+        dataset.simulated(np.random.default_rng([424242, i]), size, view_elevation=view_elevation) for i in range(count)
+    ]
+
+
+def photographed(data: Path, source: Path, count: int, size: int) -> list[dataset.Sample]:
+    """Held-out roof photographs pasted into chips; unlike in training, the radiometry is left as it is."""
+    graphs = [graph for graph in dataset.read_roof_graphs(source) if dataset.held_out(graph)]
+    chips = dataset.read_chips(data / "chips")
+    samples = []
+    for i in range(count):
+        rng = np.random.default_rng([434343, i])
+        ground = dataset.chip_sample(chips[rng.integers(len(chips))], rng, size)
+        samples.append(dataset.pasted_houses(ground, graphs, rng))
+    return samples
+
+
+def sections_of(
+    model: contracts.Model, samples: Sequence[dataset.Sample]
+) -> tuple[list[dict[str, np.ndarray]], list[heads.Sections]]:
+    """Raw maps and decoded sections of every sample."""
+    raw = []
+    for sample in samples:
+        raw.append(runtime.open_network(model, sample.geometry[None], threads=1)(sample.rgb))
+    return raw, [heads.decode_sections(maps, model.contract) for maps in raw]
+
+
+def judge_sections(
+    raw: Sequence[dict[str, np.ndarray]],
+    found: Sequence[heads.Sections],
+    samples: Sequence[dataset.Sample],
+    roof: float,
+) -> dict[str, float]:
+    """Roof IoU at the threshold `roof`, AP at overlaps 0.5 and 0.75, true and found sections."""
+    results = [matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True)]
+    strict = [matches(f.labels, f.scores, s.labels, 0.75) for f, s in zip(found, samples, strict=True)]
+    return {
+        "roof_iou": roof_iou((r["roof"][0] > roof, s.roof) for r, s in zip(raw, samples, strict=True)),
+        "ap50": average_precision(results),
+        "ap75": average_precision(strict),
+        "truths": sum(r.truths for r in results),
+        "found": sum(len(r.scores) for r in results),
+    }
+
+
+def judge_corners(
+    model: contracts.Model,
+    samples: Sequence[dataset.Sample],
+    sections: Sequence[np.ndarray],
+    reach: float = 3.0,
+) -> dict[str, float]:
+    """Corners on images blended with `sections`: share of true ones found within `reach` px and the reverse, error of
+    position (px), of height (m; bias, mean absolute) and how many σ the heights are off (root mean square)."""
+    near = far = asked = given = 0
+    offs, heights, sigmas = [], [], []
+    for sample, labels in zip(samples, sections, strict=True):
+        image = blend(sample.rgb, labels, **model.contract["blend"])
+        found = heads.decode_corners(runtime.open_network(model, sample.geometry[None])(image), model.contract)
+        points = np.stack([found.col, found.row], axis=1)
+        asked += len(sample.corners)
+        given += len(points)
+        if not len(points) or not len(sample.corners):
+            continue
+        distance, which = cKDTree(points).query(sample.corners)
+        hit = distance <= reach
+        near += hit.sum()
+        far += (cKDTree(sample.corners).query(points)[0] <= reach).sum()
+        offs.append(distance[hit])
+        known = hit & np.isfinite(sample.corner_heights)
+        heights.append(found.height[which[known]] - sample.corner_heights[known])
+        sigmas.append(found.sigma[which[known]])
+    error = np.concatenate(heights) if heights else np.zeros(0)
+    report = {"recall": near / max(asked, 1), "precision": far / max(given, 1)}
+    if near:
+        report["position"] = float(np.concatenate(offs).mean())
+    if error.size:
+        report["height_bias"] = float(error.mean())
+        report["height_mae"] = float(np.abs(error).mean())
+        report["height_in_sigma"] = float(np.sqrt(np.mean((error / np.concatenate(sigmas)) ** 2)))
+    return {k: float(v) for k, v in report.items()}
+
+
+def picture(
+    sample: dataset.Sample, raw: dict[str, np.ndarray], found: heads.Sections, corners: np.ndarray | None = None
+) -> np.ndarray:
+    """Side by side, uint8 RGB: image; truth; roof probability (red), edge (green), distance (blue); what was found."""
+    truth, outcome = sample.rgb.copy(), sample.rgb.copy()
+    truth[rims(sample.labels)] = (255, 0, 0)
+    truth[sample.labels < 0] //= 2
+    outcome[rims(found.labels)] = (255, 0, 0)
+    for col, row in corners if corners is not None else ():
+        cv2.circle(outcome, (int(col), int(row)), 1, (0, 255, 0), -1)
+    maps = np.stack([raw["roof"][0], raw["edge"][0], raw["distance"][0]], axis=2)
+    return np.hstack([sample.rgb, truth, (maps * 255).astype(np.uint8), outcome])
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Judge a pair of models on the validation sets."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.validation", description=main.__doc__)
+    parser.add_argument("--sections", required=True, help="ONNX file")
+    parser.add_argument("--corners", help="ONNX file")
+    parser.add_argument("--data", required=True, help="data folder with village/, chips/, roofgraph/")
+    parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
+    parser.add_argument("--elevation", type=float, default=59.3, help="of the view in the oblique test set, deg")
+    parser.add_argument("--count", type=int, default=12, help="simulated and pasted scenes each")
+    parser.add_argument("--out", required=True, help="report, JSON")
+    parser.add_argument("--pictures", help="folder for one picture per test set")
+    args = parser.parse_args(argv)
+    model = contracts.load(args.sections, "sections")
+    corner_model = contracts.load(args.corners, "corners") if args.corners else None
+    data, size = Path(args.data), model.contract["tile"]
+    sets = {
+        "village": village(data / "village", size),
+        "photographed": photographed(
+            data, Path(args.roofgraph or data / "roofgraph" / "roofgraph.tar"), args.count, size
+        ),
+        "simulated": simulated(args.count, size, (50.0, 90.0)),
+        "simulated_oblique": simulated(args.count, size, (args.elevation, args.elevation)),
+    }
+    report: dict[str, Any] = {}
+    for name, samples in sets.items():
+        raw, found = sections_of(model, samples)
+        report[name] = judge_sections(raw, found, samples, model.contract["thresholds"]["roof"])
+        if corner_model and name.startswith("simulated"):
+            report[name]["corners"] = judge_corners(corner_model, samples, [f.labels for f in found])
+            report[name]["corners_true_sections"] = judge_corners(corner_model, samples, [s.labels for s in samples])
+        if args.pictures:
+            sheet = np.vstack([picture(s, r, f) for s, r, f in list(zip(samples, raw, found, strict=True))[:6]])
+            with store.whole(Path(args.pictures) / f"{name}.png") as temporary:
+                cv2.imwrite(str(temporary), sheet[..., ::-1])
+        print(name, {k: round(v, 3) if isinstance(v, float) else v for k, v in report[name].items()}, flush=True)
+    store.write_json(args.out, report)
+
+
+if __name__ == "__main__":
+    cli.run(main)

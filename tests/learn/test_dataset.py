@@ -1,0 +1,137 @@
+"""Tiles: readers on tiny data sets, and transforms that must keep image and truth together."""
+
+import io
+import tarfile
+
+import cv2
+import numpy as np
+import pytest
+
+from kibs_steps.learn import dataset
+
+
+@pytest.fixture
+def marked() -> dataset.Sample:
+    """Ground with one house, a white dot at its only corner, and the same dot's displacement at 1 m as geometry."""
+    size = 32
+    sample = dataset.empty(np.zeros((size, size, 3), np.uint8))
+    sample.rgb[5, 20] = 255
+    sample.labels[5:9, 20:26] = 1
+    sample.rgb[5 + 3, 20 - 7] = 128  # the corner moved by the view's vector
+    return sample._replace(
+        corners=np.float32([[20.5, 5.5]]),
+        corner_heights=np.float32([4.0]),
+        geometry=np.float32([-7, 3, 1, 2, 1, 1]),
+    )
+
+
+@pytest.mark.parametrize("k", range(8))
+def test_dihedral_moves_corners_labels_and_vectors_with_the_image(marked, k):
+    turned = dataset.dihedral(marked, k)
+    col, row = np.floor(turned.corners[0]).astype(int)
+    assert (turned.rgb[row, col] == 255).all()
+    assert turned.labels[row, col] == 1
+    col, row = np.floor(turned.corners[0] + turned.geometry[:2]).astype(int)
+    assert (turned.rgb[row, col] == 128).all()
+    assert (turned.labels == 1).sum() == (marked.labels == 1).sum()
+    assert turned.geometry[4:].tolist() == [1, 1]
+
+
+def test_window_keeps_only_its_corners(marked):
+    part = dataset.window(marked, 2, 12, 16)
+    assert part.rgb.shape == (16, 16, 3)
+    np.testing.assert_allclose(part.corners, [[8.5, 3.5]])
+    assert (part.rgb[3, 8] == 255).all()
+    assert len(dataset.window(marked, 16, 0, 16).corners) == 0
+
+
+def test_forgotten_geometry_is_zero_and_flagged(marked):
+    forgotten = dataset.without_geometry(marked, np.random.default_rng(0), share=1.0)
+    assert not forgotten.geometry.any()
+    assert marked.geometry.any()
+
+
+def _roof_graph_files() -> dict[str, bytes]:
+    image = np.full((120, 90, 3), 90, np.uint8)
+    image[30:90, 30:60] = (0, 0, 200)  # BGR: a red roof
+    return {
+        "dt_roof_image/AA_001_0001.jpg": cv2.imencode(".jpg", image)[1].tobytes(),
+        "res_roof_graph/AA_001_0001.verts": b"30,30\n60,30\n60,90\n30,90\n30,60\n60,60\n",
+        "res_roof_graph/AA_001_0001.faces": b"0,1,5,4,0\n4,5,2,3,4\n",
+        "dt_roof_image/AA_001_0002.jpg": b"not read: it has no graph",
+    }
+
+
+@pytest.fixture(params=["folder", "tar"])
+def roof_graphs(request, tmp_path):
+    if request.param == "folder":
+        for name, content in _roof_graph_files().items():
+            path = tmp_path / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(content)
+        return tmp_path
+    with tarfile.open(tmp_path / "roofgraph.tar", "w") as tar:
+        for name, content in _roof_graph_files().items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+    return tmp_path / "roofgraph.tar"
+
+
+def test_roof_graphs_are_read_from_folder_and_tar(roof_graphs):
+    (graph,) = dataset.read_roof_graphs(roof_graphs)
+    assert graph.rgb.shape == (120 // dataset.REDUCED, 90 // dataset.REDUCED, 3)
+    assert graph.rgb[20, 15, 0] > 150  # red comes first
+    np.testing.assert_allclose(graph.vertices[2] * dataset.REDUCED, (60, 90))
+    assert [face.tolist() for face in graph.faces] == [[0, 1, 5, 4], [4, 5, 2, 3]]
+
+
+def test_missing_data_is_named(tmp_path):
+    with pytest.raises(dataset.NoTrainingData, match="roofgraph"):
+        dataset.read_roof_graphs(tmp_path / "roofgraph.tar")
+    with pytest.raises(dataset.NoTrainingData, match="chips"):
+        dataset.read_chips(tmp_path)
+
+
+def test_pasted_houses_lie_under_their_labels(tmp_path):
+    for name, content in _roof_graph_files().items():
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)
+    graphs = dataset.read_roof_graphs(tmp_path)
+    ground = dataset.empty(np.full((128, 128, 3), 30, np.uint8))
+    sample = dataset.pasted_houses(ground, graphs, np.random.default_rng(3))
+    inside = cv2.erode((sample.labels > 0).astype(np.uint8), np.ones((3, 3))) > 0
+    assert inside.sum() > 20
+    red = sample.rgb[..., 0].astype(int) - sample.rgb[..., 2]
+    assert (red[inside] > 60).mean() > 0.95
+    assert (red[(sample.labels == 0) & (sample.roof == 0)] < 60).mean() > 0.95
+    assert (sample.roof[sample.labels > 0] == 1).all()
+    assert np.isnan(sample.corner_heights).all()
+    assert (sample.labels[sample.roof == dataset.UNKNOWN] == -1).all()
+
+
+def test_chip_samples_know_roofs_and_not_sections():
+    building = np.zeros((200, 200), bool)
+    building[40:160, 40:160] = True
+    chip = dataset.Chip("x", np.where(building[..., None], 200, 20).astype(np.uint8).repeat(3, 2), building, 0.3)
+    sample = dataset.chip_sample(chip, np.random.default_rng(0), 96)
+    assert set(np.unique(sample.labels)) == {-1, 0}
+    agree = (sample.rgb[..., 0] > 110) == (sample.roof == 1)
+    assert agree.mean() > 0.99
+
+
+def test_radiometry_keeps_shape_and_is_the_same_for_a_seed():
+    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    for seed in range(20):
+        one = dataset.radiometry(rgb, np.random.default_rng(seed))
+        assert one.shape == rgb.shape
+        assert one.dtype == np.uint8
+        np.testing.assert_array_equal(one, dataset.radiometry(rgb, np.random.default_rng(seed)))
+
+
+def test_kept_samples_come_back(marked, tmp_path):
+    dataset.save(tmp_path / "a.npz", marked)
+    back = dataset.load(tmp_path / "a.npz")
+    for one, other in zip(marked, back, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,37 @@
+"""The ONNX file gives what the network gives, and carries a valid contract."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="export needs the extra `learn` (torch)")
+
+from kibs_steps.learn import export, training  # noqa: E402
+from kibs_steps.learn.architectures import OUTPUTS  # noqa: E402
+from kibs_steps.models import contract as contracts  # noqa: E402
+from kibs_steps.models import heads, runtime  # noqa: E402
+
+
+@pytest.mark.parametrize("task", ["sections", "corners"])
+def test_onnx_equals_torch(task, tmp_path):
+    torch.manual_seed(0)
+    model = training.network(task)
+    contract = export.contract_of(task, (5.0, 2.0), seed=0, commit="abc")
+    contract["tile"] = 64
+    export.export(model, tmp_path / "model.onnx", contract)
+    loaded = contracts.load(tmp_path / "model.onnx", task)
+    assert loaded.contract == contract
+    assert loaded.path.stat().st_size < 20e6
+    rgb = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    geometry = np.float32([[0.5, -1, 1, 2, 1, 1]])
+    outputs = runtime.open_network(loaded, geometry)(rgb)
+    with torch.no_grad():
+        image = torch.from_numpy(contracts.normalise(rgb, contract))
+        expected = model.eval()(image, torch.from_numpy(geometry))
+    for name, value in zip(OUTPUTS[task], expected, strict=True):
+        np.testing.assert_allclose(outputs[name], value[0].numpy(), atol=1e-3, err_msg=name)
+    if task == "sections":
+        assert heads.decode_sections(outputs, contract).labels.shape == (64, 64)
+    else:
+        np.testing.assert_allclose(outputs["height"].sum(0), 1, atol=1e-4)
+        assert (np.abs(outputs["offset"]) <= 0.5).all()
+        heads.decode_corners(outputs, contract)

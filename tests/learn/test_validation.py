@@ -1,0 +1,42 @@
+"""Measures against cases counted by hand."""
+
+import numpy as np
+import pytest
+
+from kibs_steps.learn import validation
+
+
+@pytest.fixture
+def truth() -> np.ndarray:
+    labels = np.zeros((40, 40), np.int32)
+    labels[0:10, 0:10] = 1
+    labels[0:10, 10:20] = 2
+    labels[20:30, 20:30] = 3
+    labels[38:40, 38:40] = 4  # too small to ask for
+    labels[0:10, 30:40] = -1
+    return labels
+
+
+def test_perfect_sections_have_precision_one(truth):
+    found = np.maximum(truth, 0)
+    match = validation.matches(found, np.full(4, 0.9), truth)
+    assert match.truths == 3
+    assert match.hits.all()
+    assert validation.average_precision([match]) == pytest.approx(1.0)
+
+
+def test_a_merged_and_an_invented_section_cost(truth):
+    found = np.zeros_like(truth)
+    found[0:10, 0:20] = 1  # two in one: overlap exactly one half with either
+    found[20:30, 20:30] = 2
+    found[20:30, 0:10] = 3  # not there
+    found[0:10, 30:40] = 4  # on unknown ground: not judged
+    match = validation.matches(found, np.array([0.5, 0.9, 0.8, 0.99]), truth, overlap=0.51)
+    assert match.hits.tolist() == [True, False, False]
+    assert validation.average_precision([match]) == pytest.approx(1 / 3)
+
+
+def test_roof_iou_leaves_unknown_out():
+    truth = np.array([[1, 1, 0, 255]], np.uint8)
+    found = np.array([[True, False, True, True]])
+    assert validation.roof_iou([(found, truth)]) == pytest.approx(1 / 3)
