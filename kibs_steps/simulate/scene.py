@@ -1,0 +1,370 @@
+"""Simulated scenes with exact truth: what a satellite sees of a city on its terrain, and where every roof section is.
+
+Samples lie at every half pixel of the grid, pixel edges included (2h + 1 by 2w + 1), so each pixel's centre is a sample: labels
+and heights are taken there, colours are averaged around it. The image is terrain-corrected: pixel P shows what the ray through
+the terrain point (P, T(P)) meets first. With the z-buffer's reference plane at Z0 that ray is the one at P − (T(P) − Z0)·k, and
+where it meets nothing above the terrain the pixel shows the ground at P itself.
+
+Run as a program it writes one scene: `scene.tif`, `dtm.tif`, `truth.gpkg`, `angles.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from kibs_steps import view as geometry
+from kibs_steps import zbuffer
+from kibs_steps.grid import Grid
+from kibs_steps.scene import Direction
+from kibs_steps.simulate import camera, light
+from kibs_steps.simulate.city import CLUTTER, ROOF, STYLES, City, procedural
+from kibs_steps.terrain import Terrain, flat
+
+BIAS = 0.2  # m: a face this little above another does not shade it
+
+
+class SectionTruth(NamedTuple):
+    """One roof section: where it is seen (px col, row, height above ground in m) and where it stands (map m, absolute z)."""
+
+    section: int
+    building: int
+    outline_seen: np.ndarray
+    outline_map: np.ndarray
+    holes_seen: tuple[np.ndarray, ...]
+    holes_map: tuple[np.ndarray, ...]
+    visible: float
+
+
+class Rendering(NamedTuple):
+    """A picture and its truth (see `render`)."""
+
+    rgb: np.ndarray
+    section: np.ndarray
+    height: np.ndarray
+    sections: list[SectionTruth]
+    corners: np.ndarray
+    corner_heights: np.ndarray
+    corner_sections: np.ndarray
+
+
+def _sample_frame(grid: Grid) -> Grid:
+    """The grid of samples: one at every half pixel, pixel edges included."""
+    half = grid.gsd / 2
+    return Grid(grid.crs, grid.x0 - half / 2, grid.y0 + half / 2, half, 2 * grid.width + 1, 2 * grid.height + 1)
+
+
+def _reference_frame(samples: Grid, drop: np.ndarray, k: np.ndarray) -> Grid:
+    """The samples' frame grown (by whole samples) to hold all positions P − drop·k on the reference plane."""
+    ends = np.array([drop.min(initial=0), drop.max(initial=0)])
+    left, right = (np.ceil(np.abs(ends * k[0]).max() / samples.gsd) + 1,) * 2
+    top, bottom = (np.ceil(np.abs(ends * k[1]).max() / samples.gsd) + 1,) * 2
+    if not ends.any():
+        return samples
+    return Grid(
+        samples.crs,
+        samples.x0 - left * samples.gsd,
+        samples.y0 + top * samples.gsd,
+        samples.gsd,
+        int(samples.width + left + right),
+        int(samples.height + top + bottom),
+    )
+
+
+class _Seen(NamedTuple):
+    """Per sample: shown face (−1 ground) with its position, and the section seen through roof furniture (0 none)."""
+
+    face: np.ndarray
+    points: np.ndarray
+    ground: np.ndarray
+    section: np.ndarray
+    section_z: np.ndarray
+
+
+def _see(city: City, terrain: Terrain, samples: Grid, k: tuple[float, float]) -> _Seen:
+    faces = city.faces
+    rows, cols = np.mgrid[: samples.height, : samples.width]
+    x_y = samples.to_map(np.stack([cols + 0.5, rows + 0.5], -1))
+    level = np.ptp(terrain.heights) == 0
+    base = float(terrain.heights.flat[0]) if level else float(np.mean(terrain.heights))
+    ground = np.full(x_y.shape[:2], base) if level else terrain(x_y)
+    through = x_y - (ground - base)[..., None] * np.array(k)
+    frame = _reference_frame(samples, ground - base, np.array(k))
+    planes = zbuffer.planes(faces)
+
+    def look(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        hits = zbuffer.render_faces([faces[i] for i in chosen], k, frame, base)
+        face = hits.face
+        if not level:
+            at = np.floor(frame.to_image(through)).astype(int)
+            face = face[at[..., 1], at[..., 0]]
+        found = face >= 0
+        index = np.where(found, chosen[face] if len(chosen) else -1, -1)
+        z = np.full(face.shape, -np.inf)
+        z[found] = zbuffer.heights_on(planes, index[found], through[found], k, base)
+        buried = z <= ground
+        index[buried], z[buried] = -1, -np.inf
+        return index, z
+
+    kind = np.array([f.kind for f in faces], int)
+    solid, solid_z = look(np.flatnonzero(kind != CLUTTER))
+    loose, loose_z = look(np.flatnonzero(kind == CLUTTER))
+    front = loose_z > solid_z
+    face, z = np.where(front, loose, solid), np.where(front, loose_z, solid_z)
+    own = np.array([f.section for f in faces] + [0])
+    section = own[solid]
+    z = np.where(face < 0, ground, z)
+    points = np.concatenate([through + (z - base)[..., None] * np.array(k), z[..., None]], -1)
+    points[face < 0, :2] = x_y[face < 0]
+    return _Seen(face, points, ground, section, solid_z)
+
+
+def _lit(city: City, seen: _Seen, samples: Grid, sun: tuple[float, float], facing: np.ndarray) -> np.ndarray:
+    """Whether the sun reaches each sample: 1 or 0, from a depth map in the sun's own frame."""
+    s = np.array(sun)
+    base = float(seen.ground.mean())
+    at = seen.points[..., :2] - (seen.points[..., 2:] - base) * s
+    low, high = at.reshape(-1, 2).min(0), at.reshape(-1, 2).max(0)
+    step = samples.gsd
+    width, height = (np.ceil((high - low) / step) + 2).astype(int)
+    frame = Grid("", low[0] - step, high[1] + step, step, int(width), int(height))
+    hits = zbuffer.render_faces(city.faces, sun, frame, base)
+    pixel = np.floor(frame.to_image(at)).astype(int)
+    above = hits.height[pixel[..., 1], pixel[..., 0]]
+    blocker = hits.face[pixel[..., 1], pixel[..., 0]]
+    shaded = (above > seen.points[..., 2] + BIAS) & (blocker != seen.face)
+    return np.where(shaded | ~facing, 0.0, 1.0).astype(np.float32)
+
+
+def _paint(city: City, samples: Grid) -> np.ndarray:
+    """Index of the paint on the ground at each sample."""
+    canvas = np.zeros((samples.height, samples.width), np.int32)
+    low, high = np.array(samples.bounds[:2]) - 5, np.array(samples.bounds[2:]) + 5
+    for i, paint in enumerate(city.paints):
+        if (paint.ring.max(0) < low).any() or (paint.ring.min(0) > high).any():
+            continue
+        ring = np.round((samples.to_image(paint.ring) - 0.5) * 16).astype(np.int32)
+        cv2.fillPoly(canvas, [ring], i, shift=4)
+    return canvas
+
+
+def render(
+    city: City,
+    terrain: Terrain,
+    grid: Grid,
+    view: Direction,
+    sun: Direction,
+    rng: np.random.Generator,
+    backgrounds: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    look: camera.Camera | None = None,
+) -> Rendering:
+    """Render a city on its terrain.
+
+    Returns `rgb` uint8 (h, w, 3); `section` int32 (h, w), the visible section or 0; `height` float32 (h, w), m above ground at
+    the true position, NaN off sections; `sections`, the truth of all sections whose image meets the grid; `corners` float32
+    (n, 2) px col, row of section corners that can be seen, with `corner_heights` (n,) m above ground and `corner_sections`
+    (n,). `backgrounds`: photographs of ground, uint8 (h, w, 3), each with a mask of its usable pixels, bool (h, w); drawn
+    over parts of the painted ground. `look`: the camera, drawn if None.
+    """
+    samples = _sample_frame(grid)
+    city = _near(city, terrain, samples, view.lean, sun.lean)
+    seen = _see(city, terrain, samples, view.lean)
+    table = light.surfaces(city.faces, city.paints, city.materials, rng)
+    index = np.where(seen.face >= 0, seen.face, len(city.faces) + _paint(city, samples)).ravel()
+    source = light.light(sun.lean, rng)
+    normal = table.normal[index]
+    facing = (normal @ source.direction.astype(np.float32) > 0).reshape(seen.face.shape)
+    leafy = table.leafy[index]
+    lit = _lit(city, seen, samples, sun.lean, facing | leafy.reshape(facing.shape)).ravel()
+    points = (seen.points - [grid.x0, grid.y0 - grid.height * grid.gsd, 0]).astype(np.float32)
+    table = table._replace(
+        origin=table.origin
+        - np.array([grid.x0, grid.y0 - grid.height * grid.gsd, 0])
+        * (np.arange(len(table.origin)) < len(city.faces))[:, None]
+    )
+    table = table._replace(origin=table.origin.astype(np.float32))
+    colour = light.albedo(index, points.reshape(-1, 3), table, city.materials, rng)
+    if backgrounds:
+        colour = _over_photograph(colour, (seen.face < 0).ravel(), seen.face.shape, backgrounds, grid.gsd, rng)
+    sky = light.openness(seen.points[..., 2] - seen.ground, samples.gsd).ravel()
+    shine = light.radiance(colour, normal, leafy, lit, sky, source).reshape(*seen.face.shape, 3).astype(np.float32)
+    rgb = camera.photograph(shine, look or camera.camera(rng), rng)
+
+    at = np.s_[1::2, 1::2]
+    section = seen.section[at].astype(np.int32)
+    z = seen.section_z[at]
+    height = np.full(section.shape, np.nan, np.float32)
+    on = section > 0
+    if on.any():
+        rows, cols = np.nonzero(on)
+        seen_at = grid.to_map(np.stack([cols + 0.5, rows + 0.5], -1))
+        true_at = seen_at + (z[on] - terrain(seen_at))[:, None] * np.array(view.lean)
+        height[on] = z[on] - terrain(true_at)
+    sections = _truth(city, terrain, grid, view.lean, seen.section)
+    corners = _corners(sections, section)
+    return Rendering(rgb, section, height, sections, *corners)
+
+
+def _near(city: City, terrain: Terrain, samples: Grid, view: tuple[float, float], sun: tuple[float, float]) -> City:
+    """The city without faces that can neither be seen in the frame nor throw a shadow into it."""
+    if not city.faces:
+        return city
+    low = np.array([f.ring.min(0) for f in city.faces])
+    high = np.array([f.ring.max(0) for f in city.faces])
+    floor, roof = terrain.heights.min(), terrain.heights.max()
+    top = np.maximum(high[:, 2] - floor, 0)
+    reach = top * (np.hypot(*view) + np.hypot(*sun)) + (roof - floor) * np.hypot(*view) + 2
+    left, bottom, right, upper = samples.bounds
+    near = (
+        (high[:, 0] + reach > left)
+        & (low[:, 0] - reach < right)
+        & (high[:, 1] + reach > bottom)
+        & (low[:, 1] - reach < upper)
+    )
+    return city._replace(faces=[city.faces[i] for i in np.flatnonzero(near)])
+
+
+def _over_photograph(
+    colour: np.ndarray,
+    ground: np.ndarray,
+    shape: tuple[int, int],
+    backgrounds: list[tuple[np.ndarray, np.ndarray]],
+    gsd: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Albedo with a photograph laid over the ground where it is usable."""
+    picture, usable = backgrounds[int(rng.integers(len(backgrounds)))]
+    k = int(rng.integers(4))
+    picture, usable = np.rot90(picture, k), np.rot90(usable, k)
+    if rng.random() < 0.5:
+        picture, usable = picture[:, ::-1], usable[:, ::-1]
+    scale = rng.uniform(1.6, 2.6)
+    need = np.array(shape) / scale
+    row, col = (int(rng.integers(0, max(1, int(have - want)))) for have, want in zip(usable.shape, need, strict=True))
+    centre = np.array([[scale, 0, -scale * col], [0, scale, -scale * row]], np.float32)
+    size = (shape[1], shape[0])
+    laid = cv2.warpAffine(
+        np.ascontiguousarray(picture), centre, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
+    mask = cv2.warpAffine(np.ascontiguousarray(usable).astype(np.uint8), centre, size, flags=cv2.INTER_NEAREST)
+    chosen = ground & (mask.ravel() > 0)
+    colour = colour.copy()
+    colour[chosen] = 0.75 * (laid.reshape(-1, 3)[chosen].astype(np.float32) / 255) ** np.float32(rng.uniform(1.4, 2.2))
+    return colour
+
+
+def _truth(city: City, terrain: Terrain, grid: Grid, k: tuple[float, float], seen: np.ndarray) -> list[SectionTruth]:
+    counts = np.bincount(seen[1:-1, 1:-1].ravel()) if seen.size else np.zeros(1)
+    roofs = [f for f in city.faces if f.kind == ROOF]
+    if not roofs:
+        return []
+    rings = [ring for f in roofs for ring in (f.ring, *f.holes)]
+    points = np.concatenate(rings)
+    above = points[:, 2] - terrain(points[:, :2])
+    at = grid.to_image(geometry.image_position(points[:, :2], points[:, 2], k, terrain))
+    shown = np.split(np.column_stack([at, above]), np.cumsum([len(r) for r in rings])[:-1])
+    out, i = [], 0
+    for face in roofs:
+        outline, holes = shown[i], tuple(shown[i + 1 : i + 1 + len(face.holes)])
+        i += 1 + len(face.holes)
+        low, high = outline[:, :2].min(0), outline[:, :2].max(0)
+        if (high < 0).any() or low[0] > grid.width or low[1] > grid.height:
+            continue
+        size = abs(_area(outline)) - sum(abs(_area(h)) for h in holes)
+        count = counts[face.section] if face.section < len(counts) else 0
+        visible = float(np.clip(count / 4 / max(size, 1e-6), 0, 1))
+        out.append(SectionTruth(face.section, face.building, outline, face.ring, holes, face.holes, visible))
+    return out
+
+
+def _area(ring: np.ndarray) -> float:
+    x, y = ring[:, 0], ring[:, 1]
+    return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
+
+
+def _corners(sections: list[SectionTruth], labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distinct corners with a pixel of their section within one pixel: px, heights, section."""
+    rings = [(s.section, s.building, ring) for s in sections for ring in (s.outline_seen, *s.holes_seen)]
+    if not rings:
+        return np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32)
+    points = np.concatenate([r for _, _, r in rings])
+    section = np.repeat([s for s, _, _ in rings], [len(r) for _, _, r in rings])
+    building = np.repeat([b for _, b, _ in rings], [len(r) for _, _, r in rings])
+    height, width = labels.shape
+    inside = (points[:, 0] >= 0) & (points[:, 0] < width) & (points[:, 1] >= 0) & (points[:, 1] < height)
+    points, section, building = points[inside], section[inside], building[inside]
+    padded = np.pad(labels, 1)
+    col, row = np.floor(points[:, 0]).astype(int) + 1, np.floor(points[:, 1]).astype(int) + 1
+    seen = np.zeros(len(points), bool)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            seen |= padded[row + i, col + j] == section
+    points, section, building = points[seen], section[seen], building[seen]
+    # One corner of several sections (a ridge end, an eave corner) counts once: same building, 5 cm.
+    key = np.column_stack([building, np.round(points[:, :2] * 4).astype(int), np.round(points[:, 2] * 20).astype(int)])
+    _, first = np.unique(key, axis=0, return_index=True)
+    first.sort()
+    return points[first, :2].astype(np.float32), points[first, 2].astype(np.float32), section[first].astype(np.int32)
+
+
+def _direction(azimuth: float, elevation: float, convergence: float = 0.0) -> Direction:
+    return Direction(azimuth, elevation, geometry.lean(azimuth, elevation, convergence))
+
+
+def geometry_vector(view: Direction, sun: Direction, gsd: float) -> np.ndarray:
+    """The networks' geometry input, float32 (6,): lean of view (col, row) and of shadows, px per m of height, known flags.
+
+    A roof point at height h is shown at ground px + h·[0:2], its shadow tip falls at ground px + h·[2:4].
+    """
+    (kx, ky), (sx, sy) = view.lean, sun.lean
+    return np.array([-kx / gsd, ky / gsd, -sx / gsd, sy / gsd, 1.0, 1.0], np.float32)
+
+
+def relief(
+    rng: np.random.Generator,
+    bounds: tuple[float, float, float, float],
+    step: float,
+    amplitude: float,
+    slope: float,
+    base: float = 0.0,
+) -> Terrain:
+    """Terrain over `bounds` (left, bottom, right, top): smooth waves of `amplitude` (m) on a plane of `slope` (m/m), float32."""
+    x = np.arange(bounds[0] + step / 2, bounds[2] + step / 2, step)
+    y = np.arange(bounds[3] - step / 2, bounds[1] - step / 2, -step)
+    angle = rng.uniform(0, 2 * np.pi)
+    cx, cy = x - x.mean(), y - y.mean()
+    z = base + slope * (np.cos(angle) * cx[None] + np.sin(angle) * cy[:, None])
+    for _ in range(3 if amplitude else 0):
+        length, turn, phase = rng.uniform(150, 500), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+        wave = 2 * np.pi / length * (np.cos(turn) * cx[None] + np.sin(turn) * cy[:, None]) + phase
+        z = z + amplitude / 3 * np.sin(wave)
+    return Terrain(z.astype(np.float32).astype(np.float64), float(x[0]), float(y[0]), (step, step))
+
+
+def random_scene(
+    rng: np.random.Generator,
+    size: int = 256,
+    gsd: float = 0.38,
+    view_elevation: tuple[float, float] = (50, 90),
+    sun_elevation: tuple[float, float] = (20, 70),
+    backgrounds: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    style: str | None = None,
+) -> tuple[Rendering, np.ndarray]:
+    """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md)."""
+    side = size * gsd
+    grid = Grid("", 0.0, side, gsd, size, size)
+    view = _direction(rng.uniform(0, 360), min(rng.uniform(*view_elevation), 89.9))
+    sun = _direction(rng.uniform(0, 360), rng.uniform(*sun_elevation))
+    style = style or str(rng.choice([*STYLES, "mixed"], p=[0.2, 0.15, 0.11, 0.12, 0.11, 0.1, 0.03, 0.05, 0.13]))
+    margin = 25.0 + (15.0 if style in ("centre", "perimeter") else 0.0)
+    terrain = flat(0.0)
+    if rng.random() < 0.35:
+        low, high = -margin - 60, side + margin + 60
+        terrain = relief(rng, (low, low, high, high), 2.0, rng.uniform(0, 6), rng.uniform(0, 0.15))
+    city = procedural(rng, side + 2 * margin, side + 2 * margin, terrain, style, (-margin, -margin))
+    picture = render(city, terrain, grid, view, sun, rng, backgrounds if rng.random() < 0.5 else None)
+    return picture, geometry_vector(view, sun, gsd)
