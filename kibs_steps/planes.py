@@ -28,6 +28,7 @@ SHARED = 2.0  # px: a corner on a ridge or eave belongs to every section whose r
 SLOPE_PRIOR = 0.7  # standard deviation of a roof's gradient per axis: 35° is ordinary, 60° is rare
 SIGMA_FLOOR = 0.02  # m
 TUKEY = 4.0  # residuals beyond 4 σ do not count
+MOST_STARTS = 12  # points whose triples are tried: 220 planes
 MAX_SLOPE = 72.0  # deg, in the map frame
 MAX_HEIGHT = 200.0  # m above ground: taller than any building of a city without high-rises is a mistake
 MIN_AREA = 12.0  # px: smaller areas are specks, not roofs
@@ -97,23 +98,32 @@ def flat(z: float, middle: np.ndarray) -> Plane:
 def robust_plane(points: Points, middle: np.ndarray) -> tuple[Plane, float]:
     """Least squares plane through points, and the σ of its height at `middle` (map, m).
 
-    Weights 1/σ² and Tukey's biweight (10 rounds from a Huber start); gradient prior N(0, `SLOPE_PRIOR`²).
+    Weights 1/σ² and a gradient prior N(0, `SLOPE_PRIOR`²). Starts from the best of all planes through three points (a few
+    points with one wild among them mislead every average), then Tukey's biweight.
     """
     sigma = np.maximum(points.sigma, SIGMA_FLOOR)
     design = np.column_stack([points.x - middle[0], points.y - middle[1], np.ones(len(sigma))])
     prior = np.diag([SLOPE_PRIOR**-2, SLOPE_PRIOR**-2, 0.0])
-    weight = sigma**-2
-    robust = np.ones(len(sigma))
-    for turn in range(12):
-        w = weight * robust
-        normal = design.T @ (w[:, None] * design) + prior
-        solution = np.linalg.solve(normal, design.T @ (w * points.z))
+
+    def solve(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        normal = design.T @ (weight[:, None] * design) + prior
+        return normal, np.linalg.solve(normal, design.T @ (weight * points.z))
+
+    sharpest = np.sort(np.argsort(sigma, kind="stable")[:MOST_STARTS])
+    triples = np.array(list(combinations(sharpest.tolist(), 3)))
+    a = design[triples]
+    w = sigma[triples] ** -2.0
+    normals = np.einsum("tni,tn,tnj->tij", a, w, a) + prior
+    starts = np.linalg.solve(normals, np.einsum("tni,tn,tn->ti", a, w, points.z[triples])[..., None])[..., 0]
+    starts = np.vstack([solve(sigma**-2.0)[1], starts])
+    residuals = np.abs(points.z - starts @ design.T) / sigma
+    steepness = ((starts[:, :2] / SLOPE_PRIOR) ** 2).sum(axis=1)
+    solution = starts[np.argmin((np.minimum(residuals, TUKEY) ** 2).sum(axis=1) + steepness)]
+    for _ in range(8):
         residual = np.abs(points.z - design @ solution) / sigma
         scale = max(1.0, float(np.median(residual)) / 0.6745)
-        if turn < 2:
-            robust = np.minimum(1.0, 1.5 * scale / np.maximum(residual, 1e-9))
-        else:
-            robust = np.maximum((1 - np.minimum(residual / (TUKEY * scale), 1.0) ** 2) ** 2, 1e-6)
+        robust = np.maximum((1 - np.minimum(residual / (TUKEY * scale), 1.0) ** 2) ** 2, 1e-6)
+        normal, solution = solve(robust * sigma**-2.0)
     variance = np.linalg.inv(normal)[2, 2] * scale**2
     return Plane(*map(float, solution), float(middle[0]), float(middle[1])), float(np.sqrt(variance))
 

@@ -126,7 +126,7 @@ def distinct_corners(corners: pa.Table) -> pa.Table:
 
     Corners with an owner (truth) are never merged. Sorted by position.
     """
-    table = corners.sort_by([("row", "ascending"), ("col", "ascending"), ("owner", "ascending")])
+    table = corners.sort_by([(key, "ascending") for key in ("row", "col", "owner", "tile_row", "tile_col")])
     if not len(table):
         return table
     xy = np.stack([table["col"].to_numpy(), table["row"].to_numpy()], axis=1)
@@ -168,17 +168,23 @@ def stitch(
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
     corners may lie.
     """
+    # Pieces are numbered by tile, whatever block a tile belongs to, so that sums over them do not depend on blocks.
+    every = pa.concat_tables(pieces)
+    order = np.lexsort([every[key].to_numpy() for key in ("label", "tile_col", "tile_row")])
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    every = every.take(pa.array(order))
     number: dict[tuple[int, int], dict[int, int]] = {}
     used, all_links = 0, [np.zeros((0, 2), np.int64)]
     for block, table, inner in zip(blocks, pieces, links, strict=True):
         labels = table["label"].to_pylist()
-        own = number[block.row, block.col] = {label: used + i for i, label in enumerate(labels)}
+        own = dict(zip(labels, rank[used : used + len(labels)].tolist(), strict=True))
+        number[block.row, block.col] = own
         pairs = zip(inner["first"].to_pylist(), inner["second"].to_pylist(), strict=True)
         all_links.append(np.array([(own[a], own[b]) for a, b in pairs], np.int64).reshape(-1, 2))
         used += len(labels)
     all_links.append(block_links({(b.row, b.col): s for b, s in zip(blocks, seams, strict=True)}, number))
     link = np.concatenate(all_links)
-    every = pa.concat_tables(pieces)
     stands = confirmed(every["core_area"].to_numpy(), every["full_area"].to_numpy(), link)
     outlines = shapely.from_wkb(every["outline"].to_numpy(zero_copy_only=False)[stands])
     columns = united(

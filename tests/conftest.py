@@ -1,1 +1,18 @@
-"""Puts this folder on the path, so that tests of every step can import `toy`."""
+"""Fixtures shared by all tests; `toy` is importable as a module."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture
+def kibs_data() -> Path:
+    """The folder of shared real data; the test is skipped, by name, without it."""
+    folder = os.environ.get("KIBS_DATA")
+    if not folder:
+        pytest.skip("KIBS_DATA is not set: no real data here")
+    return Path(folder)

@@ -1,0 +1,194 @@
+"""Corners to planes: closed-form roofs, the paper's rules, statuses, filing hazards."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kibs_steps import planes, terrain, view
+from kibs_steps.planes import Points
+
+
+def points(xyz, sigma=0.5, ground=0.0):
+    x, y, z = np.asarray(xyz, float).T
+    return Points(x, y, z, z - ground, np.full(len(x), sigma))
+
+
+SLOPE = view.Plane(0.3, -0.4, 7.0, 0.0, 0.0)
+SQUARE = np.array([[-5.0, -4.0], [5.0, -4.0], [5.0, 4.0], [-5.0, 4.0]])
+MIDDLE = np.zeros(2)
+
+
+def on_plane(xy):
+    return points(np.column_stack([xy, SLOPE.at(xy)]))
+
+
+@pytest.mark.parametrize("rule", ["robust", "paper"])
+def test_three_corners_give_their_plane(rule):
+    """Exact corners of two distinct heights: both rules return the plane (the paper's filing keeps two equal heights)."""
+    level = view.Plane(0.0, 0.5, 6.0, 0.0, 0.0)
+    xyz = np.column_stack([SQUARE, level.at(SQUARE)])
+    found = planes.fit(points(xyz, 0.01), 80.0, MIDDLE, 0.0, (6.11, 3.0), rule)
+    assert found.status == "ok"
+    np.testing.assert_allclose(found.plane[:3], level[:3], atol=2e-4)
+
+
+def test_one_wild_corner_is_outvoted():
+    """Five corners on a plane and one 8 m too high: the robust plane stays within 0.2 m, plain least squares does not."""
+    xy = np.vstack([SQUARE, [[0.0, 4.0], [0.0, -4.0]]])
+    good = on_plane(xy)
+    z = good.z.copy()
+    z[2] += 8.0
+    wild = good._replace(z=z, height=z)
+    plane, _ = planes.robust_plane(wild, MIDDLE)
+    assert np.abs(plane.at(xy) - SLOPE.at(xy)).max() < 0.2
+    design = np.column_stack([xy, np.ones(6)])
+    plain = design @ np.linalg.lstsq(design, z, rcond=None)[0]
+    assert np.abs(plain - SLOPE.at(xy)).max() > 1.0
+
+
+def test_sigma_matches_spread_of_repeated_fits():
+    """The σ of the height at the middle is what repeated noisy fits scatter by."""
+    rng = np.random.default_rng(1)
+    xy = np.vstack([SQUARE, SQUARE / 2])
+    heights, sigmas = [], []
+    for _ in range(400):
+        noisy = on_plane(xy)
+        noisy = noisy._replace(z=noisy.z + rng.normal(0, 0.5, len(xy)))
+        plane, sigma = planes.robust_plane(noisy, MIDDLE)
+        heights.append(plane.at(MIDDLE))
+        sigmas.append(sigma)
+    assert np.mean(sigmas) == pytest.approx(np.std(heights), rel=0.3)
+
+
+@pytest.mark.parametrize(("n", "status"), [(0, "no_corners"), (1, "one_corner"), (2, "two_corners")])
+def test_few_corners_give_level_planes(n, status):
+    """Paper: none gives the training mean, one its height, two their mean; above the ground at the section."""
+    xyz = np.array([[1.0, 1.0, 104.0], [2.0, 3.0, 108.0]])[:n].reshape(-1, 3)
+    found = planes.fit(points(xyz, ground=100.0), 50.0, MIDDLE, 100.0, (6.11, 3.0), "robust")
+    assert found.status == status
+    assert found.reason
+    expected = {0: 106.11, 1: 104.0, 2: 106.0}[n]
+    assert (found.plane.a, found.plane.b) == (0, 0)
+    assert found.plane.c == pytest.approx(expected)
+
+
+def test_paper_rule_distrusts_thin_and_huge_triangles():
+    xyz = np.array([[0, 0, 5.0], [10, 0, 5.0], [5, 0.2, 9.0]])
+    for area in (50.0, 0.1):
+        found = planes.fit(points(xyz), area, MIDDLE, 0.0, (6.11, 3.0), "paper")
+        assert found.status == "degenerate_triangle"
+        assert found.plane.c == pytest.approx(6.11)
+
+
+def test_corners_in_a_row_leave_the_other_direction_level():
+    """Three corners on one line fix the slope along it; the prior keeps the plane level across it."""
+    xyz = np.array([[-5, 0, 4.0], [0, 0, 6.0], [5, 0, 8.0]])
+    found = planes.fit(points(xyz, 0.05), 60.0, MIDDLE, 0.0, (6.11, 3.0), "robust")
+    assert found.status == "degenerate_triangle"
+    assert found.plane.a == pytest.approx(0.4, abs=0.01)
+    assert found.plane.b == pytest.approx(0.0, abs=1e-6)
+
+
+@given(st.lists(st.tuples(st.floats(-20, 20), st.floats(-20, 20)), min_size=3, max_size=12, unique=True))
+def test_largest_triangle_is_the_largest(xy):
+    """Against all triples by brute force."""
+    from itertools import combinations
+
+    x, y = np.array(xy).T
+    best = max(abs((x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])) / 2 for a, b, c in combinations(range(len(x)), 3))
+    _, area = planes.largest_triangle(x, y)
+    assert area == pytest.approx(best, rel=1e-6, abs=1e-6)
+
+
+@given(st.lists(st.floats(0, 60), min_size=3, max_size=3))
+def test_filing_of_heights(heights):
+    """The paper's rule keeps the sum of the two merged heights and leaves exactly two values."""
+    z = sorted(heights)
+    filed = planes.filed_heights(*z)
+    assert sum(filed) == pytest.approx(sum(z))
+    if z[0] < z[1] < z[2]:
+        assert len(set(filed)) <= 2
+        assert filed[2] == z[2] if z[1] < (z[0] + z[2]) / 2 else filed[0] == z[0]
+    else:
+        assert list(filed) == z
+
+
+def filed(outlines, corners, reach=7.5, shared=2.0):
+    none = np.zeros(len(corners), int)
+    section, corner = planes.file_corners(np.array(outlines), np.array(corners, float), none, np.zeros(len(outlines), int), reach, shared)
+    return list(zip(section.tolist(), corner.tolist(), strict=True))
+
+
+def test_corner_on_a_ridge_belongs_to_both_sections():
+    boxes = [shapely.box(0, 0, 20, 10), shapely.box(0, 10, 20, 20)]
+    assert filed(boxes, [(0.4, 10.3)]) == [(0, 0), (1, 0)]
+
+
+def test_corner_over_a_neighbour_goes_to_the_nearest_rim():
+    """Hazard: a corner whose square covers a second house, clearly nearer to the first."""
+    boxes = [shapely.box(0, 0, 20, 10), shapely.box(0, 15, 20, 30)]
+    assert filed(boxes, [(10, 11)]) == [(0, 0)]
+
+
+def test_corner_too_far_off_is_filed_to_none():
+    assert filed([shapely.box(0, 0, 20, 10)], [(40, 5)]) == []
+
+
+def test_corner_inside_a_section_still_counts_from_its_rim():
+    """Hazard: which pixel of the rim; a corner placed inside by two pixels is as good as one outside by two."""
+    box = [shapely.box(0, 0, 30, 30)]
+    assert filed(box, [(2, 2), (-1.4, -1.4), (15, 15)]) == [(0, 0), (0, 1)]
+
+
+def test_owned_corners_go_to_their_owner_only():
+    boxes = np.array([shapely.box(0, 0, 20, 10), shapely.box(0, 10, 20, 20)])
+    section, corner = planes.file_corners(boxes, np.array([[0.0, 10.0]]), np.array([7]), np.array([3, 7]), 7.5, 2.0)
+    assert (section.tolist(), corner.tolist()) == ([1], [0])
+
+
+@pytest.mark.parametrize(
+    ("change", "status"),
+    [
+        ({}, "ok"),
+        ({"edge": True}, "raster_edge"),
+        ({"void": True}, "cloud_or_nodata"),
+        ({"area_px": 4.0}, "too_small"),
+        ({"ground": 30.0}, "implausible_height"),
+    ],
+)
+def test_statuses(change, status):
+    found = planes.fit(on_plane(SQUARE), 80.0, MIDDLE, 0.0, (6.11, 3.0), "robust")
+    arguments = {"area_px": 400.0, "ground": 0.0, "middle": MIDDLE, "edge": False, "void": False, **change}
+    result = planes.checked(found, on_plane(SQUARE), **arguments)
+    assert result.status == status
+    assert bool(result.reason) == (status != "ok")
+
+
+def test_implausible_slope_is_made_level():
+    steep = view.Plane(6.0, 0.0, 10.0, 0.0, 0.0)
+    found = planes.Fit(steep, 0.1, "ok", "")
+    result = planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, False, False)
+    assert result.status == "implausible_slope"
+    assert (result.plane.a, result.plane.b) == (0, 0)
+
+
+def table_of(outlines):
+    n = len(outlines)
+    return pa.table(
+        {
+            "section_id": np.arange(1, n + 1),
+            "outline": shapely.to_wkb(np.array(outlines)),
+            "score": np.ones(n),
+            "split": np.full(n, 2),
+            "edge": np.zeros(n, bool),
+            "void": np.zeros(n, bool),
+            "owner": np.arange(1, n + 1),
+        }
+    )
+
+
+def test_terrain_flat_reads_constant():
+    assert (terrain.flat(12.5)(np.zeros((3, 2))) == 12.5).all()

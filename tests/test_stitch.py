@@ -1,0 +1,161 @@
+"""Detections through stitching: the same sections whatever the blocks, and every section whole."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import shapely
+import toy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kibs_steps import corners, sections, stitch
+from kibs_steps.grid import Grid, Tiling, Window
+from kibs_steps.models import contract, heads, runtime
+
+WIDTH, HEIGHT = 300, 230
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A painted raster, its sections, and both toy networks."""
+    folder = toy.models(tmp_path_factory.mktemp("models"))
+    truth = toy.houses(np.random.default_rng(3), WIDTH, HEIGHT)
+    nets = {}
+    for task in ("sections", "corners"):
+        model = contract.load(folder / f"{task}.onnx", task)
+        nets[task] = (runtime.open_network(model, np.zeros((1, 6), np.float32)), model.contract)
+    return toy.paint(truth, WIDTH, HEIGHT), truth, nets
+
+
+def detections(image, block_side, nets, shuffle=None):
+    """Stitched sections and corners of all blocks together, sorted by id."""
+    grid = Grid("EPSG:32631", toy.X0, toy.Y0, toy.GSD, image.shape[1], image.shape[0])
+    tiling = Tiling(toy.TILE, toy.MARGIN, block_side)
+    padded = np.pad(image, ((toy.MARGIN, toy.MARGIN), (toy.MARGIN, toy.MARGIN), (0, 0)), mode="edge")
+    inside = np.pad(np.ones(image.shape[:2], bool), toy.MARGIN)
+    blocks = tiling.blocks(grid.width, grid.height)
+    if shuffle is not None:
+        blocks = [blocks[i] for i in shuffle.permutation(len(blocks))]
+    pieces, links, seams, found = [], [], [], []
+    for block in blocks:
+        core = tiling.block_core(block, grid.width, grid.height)
+        window = (slice(core.row, core.row + core.height + 2 * toy.MARGIN), slice(core.col, core.col + core.width + 2 * toy.MARGIN))
+        network, terms = nets["sections"]
+        views = sections.detect(padded[window], inside[window], tiling, block, grid, network, terms)
+        pieces.append(sections.pieces(views, inside[window], tiling, core))
+        inner = sections.inner_links(views, toy.MARGIN)
+        links.append(pa.table({"first": inner[:, 0], "second": inner[:, 1]}))
+        seams.append(sections.seams(views, toy.MARGIN))
+        network, terms = nets["corners"]
+        tables = []
+        for view in views:
+            place = sections.window_in_block(tiling.window(view.tile), core, toy.MARGIN)
+            rgb = sections.padded(padded[window], place)
+            tables.append(corners.of_tile(heads.decode_corners(network(rgb), terms), view.tile, tiling))
+        found.append(pa.concat_tables(tables))
+    out = stitch.stitch(blocks, pieces, links, seams, found, grid, tiling, 0.0, 3.0)
+    return pa.concat_tables(out[0]).sort_by("section_id"), pa.concat_tables(out[1])
+
+
+def test_every_painted_section_comes_back_once(world):
+    """Sections cut by several seams are one section; the outline is the painted rectangle less its corner pixels."""
+    image, truth, nets = world
+    table, _ = detections(image, 2, nets)
+    outlines = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False))
+    assert len(outlines) == len(truth)
+    for col, row, w, h, *_ in truth:
+        box = shapely.box(col, row, col + w, row + h)
+        iou = shapely.area(shapely.intersection(outlines, box)) / shapely.area(shapely.union(outlines, box))
+        assert iou.max() > 1 - 6 / (w * h)
+
+
+@pytest.mark.parametrize("side", [1, 3, 16])
+def test_blocks_do_not_matter(world, side):
+    """Another block size, or another order of blocks, gives the same ids, outlines, scores."""
+    image, _, nets = world
+    expected, expected_corners = detections(image, 2, nets)
+    table, found = detections(image, side, nets, shuffle=np.random.default_rng(side))
+    assert table.equals(expected)
+    assert places(found) == places(expected_corners)
+
+
+def places(corners):
+    """Corners as a set: a corner near sections of two blocks is listed for both."""
+    return {(c["col"], c["row"], c["height"]) for c in corners.to_pylist()}
+
+
+def test_corners_on_seams_are_kept_once(world):
+    """Every painted corner comes back exactly once, also those within a pixel of a tile's seam."""
+    image, truth, nets = world
+    _, found = detections(image, 16, nets)
+    painted = set()
+    for col, row, w, h, *_ in truth:
+        painted |= {(c + 0.5, r + 0.5) for c in (col, col + w - 1) for r in (row, row + h - 1)}
+    got = list(zip(found["col"].to_pylist(), found["row"].to_pylist(), strict=True))
+    assert len(got) == len(set(got))
+    assert set(got) <= painted
+    # Two sections' corners on a ridge lie one pixel apart; where a seam runs between them they count as one.
+    for col, row in painted - set(got):
+        assert min(abs(col - c) + abs(row - r) for c, r in got) <= 1
+
+
+def test_shifted_raster_shifts_sections(world):
+    """Cutting whole tile strides off the raster moves sections by as much and changes nothing else."""
+    image, _, nets = world
+    stride = toy.TILE - 2 * toy.MARGIN
+    table, _ = detections(image, 2, nets)
+    cut, _ = detections(image[:, stride:], 2, nets)
+    outlines = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False))
+    moved = shapely.transform(outlines, lambda c: c - [stride, 0])
+    whole = {shapely.normalize(g).wkt for g in moved[shapely.bounds(moved)[:, 0] > toy.MARGIN]}
+    assert whole <= {shapely.normalize(g).wkt for g in shapely.from_wkb(cut["outline"].to_numpy(zero_copy_only=False))}
+
+
+def test_links_need_mutual_choice():
+    """A label that covers two of the neighbour's is linked to the larger one only; slight overlaps are not links."""
+    first = np.zeros((10, 8), int)
+    second = np.zeros((10, 8), int)
+    first[:, :] = 1
+    second[:6], second[6:] = 1, 2
+    assert stitch.links_across(first, second).tolist() == [[1, 1]]
+    second[:] = 0
+    second[:2] = 5
+    assert stitch.links_across(first, second).tolist() == []
+
+
+def test_unconfirmed_slivers_are_voted_out():
+    """A piece that lies mostly in the neighbour's core and is not linked falls; a linked or mostly inner one stands."""
+    core, full = np.array([4, 4, 40, 0]), np.array([30, 30, 60, 12])
+    assert stitch.confirmed(core, full, np.array([[1, 2]])).tolist() == [False, True, True, False]
+
+
+def test_ids_are_positions_and_unique():
+    grid = Grid("EPSG:32631", 0.0, 0.0, 1.0, 50, 40)
+    boxes = np.array([shapely.box(10, 10, 20, 20), shapely.box(30, 5, 34, 9)])
+    ids = stitch.section_ids(boxes, grid)
+    for one, box in zip(ids, boxes, strict=True):
+        row, col = divmod(int(one) - 1, 50)
+        assert box.contains(shapely.Point(col + 0.5, row + 0.5))
+    thin = np.array([shapely.box(10, 10, 10.2, 11), shapely.box(10.3, 10, 10.5, 11)])
+    assert len(set(stitch.section_ids(thin, grid).tolist())) == 2
+    assert (np.sort(stitch.section_ids(boxes[::-1], grid)) == np.sort(ids)).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000))
+def test_simplified_outlines_keep_sharing_rims(seed):
+    """Smoothing a label image leaves no overlap and no gap between sections, and areas within a few pixels."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((24, 24), np.int32)
+    points = rng.uniform(4, 20, (4, 2))
+    rows, cols = np.mgrid[4:20, 4:20]
+    near = np.argmin((rows[..., None] - points[:, 0]) ** 2 + (cols[..., None] - points[:, 1]) ** 2, axis=-1)
+    labels[4:20, 4:20] = near + 1
+    parts = sections.pixel_outlines(labels, Window(0, 0, 24, 24))
+    outlines = np.array([p for g in shapely.from_wkb(list(parts.values())) for p in shapely.get_parts(g)])
+    smooth = stitch.simplified(outlines, 1.5)
+    assert shapely.is_valid(smooth).all()
+    union = shapely.union_all(smooth)
+    assert shapely.area(smooth).sum() == pytest.approx(shapely.area(union), abs=1e-6)
+    assert not shapely.get_num_interior_rings(shapely.get_parts(union)).any()
+    assert abs(shapely.area(union) - 256) < 12
