@@ -10,6 +10,7 @@ the unit of a job.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +54,12 @@ class Grid(NamedTuple):
         """The grid of a window: same pixels, its own corner and size."""
         left, top = self.to_map(np.array([window.col, window.row]))
         return self._replace(x0=float(left), y0=float(top), width=window.width, height=window.height)
+
+    def windows(self, side: int) -> Iterator[Window]:
+        """Windows of at most `side` px that cover the grid, row by row."""
+        for row in range(0, self.height, side):
+            for col in range(0, self.width, side):
+                yield Window(col, row, min(side, self.width - col), min(side, self.height - row))
 
     def to_map(self, col_row: np.ndarray) -> np.ndarray:
         """Map metres (n, 2) of image coordinates (n, 2)."""

@@ -17,8 +17,8 @@ import pyarrow as pa
 import shapely
 from numpy.typing import NDArray
 
+from kibs_steps import cli, store, view, zbuffer
 from kibs_steps import scene as scenes
-from kibs_steps import store, view, zbuffer
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid, Window
 from kibs_steps.scene import Scene
@@ -206,7 +206,7 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
 
     own = layer.columns.get("section_id", layer.columns.get("truth_id"))
     numbered = np.arange(1, len(polygons) + 1)
-    ids = numbered if own is None or len(np.unique(own)) < len(own) else own
+    ids = own if own is not None and _are_labels(own) else numbered
     building = layer.columns.get("building_id", layer.columns.get("building"))
     split, visible = layer.columns.get("split"), layer.columns.get("visible")
 
@@ -226,6 +226,13 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
             "visible": taken(visible, pa.float64()),
         }
     )
+
+
+def _are_labels(ids: NDArray) -> bool:
+    """Whether a file's own section ids can be labels of pixels: whole, positive, one per section, below 2³¹."""
+    ids = np.asarray(ids, float)
+    fits = np.isfinite(ids).all() and (ids == np.floor(ids)).all() and ids.min() > 0 and ids.max() < 2**31
+    return bool(fits) and len(np.unique(ids)) == len(ids)
 
 
 def _meets(boxes: NDArray[np.float64], bounds: tuple[float, ...], margin: float) -> NDArray[np.bool_]:
@@ -340,8 +347,8 @@ def _walls(outlines: NDArray[np.object_], lean: tuple[float, float], terrain: Su
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Truth layer -> `truth.parquet`."""
-    parser = argparse.ArgumentParser(prog="kibs_steps.truth", description="Bring a truth layer into both frames.")
+    """Bring a truth layer into both frames: `truth.parquet`."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.truth", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
     parser.add_argument("--truth", required=True, help="vector file of PolygonZ roof sections, any CRS")
     parser.add_argument("--frame", choices=FRAMES, default="image", help="where roofs are drawn: seen or standing")
@@ -353,6 +360,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    from kibs_steps.cli import run
-
-    run(main)
+    cli.run(main)

@@ -6,7 +6,7 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
-import toy
+import toy_city as toy
 
 from kibs_steps import store, truth
 from kibs_steps.grid import Window
