@@ -1,164 +1,165 @@
-"""A toy world for tests: houses painted in plain colours, and ONNX models that read those colours.
+"""A toy scene made by hand: sloping ground, a gable house, a tall block with a courtyard, a shed behind it.
 
-Roofs are red (R > 150) with the section's own green; corner pixels are (0, 8·height, 255). The models are a handful of ONNX
-operators, so detections are exact and every step runs in milliseconds.
+Everything is given in the map frame in closed form; what the image shows follows from `kibs_steps.view`.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
-import onnx
+import pyarrow as pa
 import rasterio
+import shapely
 from affine import Affine
-from onnx import TensorProto, helper, numpy_helper
 
-TILE, MARGIN, GSD = 64, 8, 0.38
-X0, Y0 = 500_000.0, 5_400_000.0
-CENTRES = [float(h) for h in range(32)]
-VIEW = {"view_azimuth": 181.1, "view_elevation": 59.3}
+from kibs_steps import scene as scenes
+from kibs_steps import store, view
+from kibs_steps.scene import Scene
 
-Section = tuple[int, int, int, int, int, tuple[float, float, float, float]]  # col, row, width, height, green, heights
+CRS = "EPSG:32631"
+X0, Y0, GSD, WIDTH, HEIGHT = 590000.0, 5750000.0, 0.5, 320, 240
+GROUND = view.Plane(0.05, -0.03, 12.0, X0, Y0)  # the terrain: a plane, so bilinear reading is exact
 
 
-def contract(task: str, **changes: object) -> dict:
-    """A valid contract for a toy model."""
-    base = {
-        "contract": 1,
-        "task": task,
-        "head": "dense",
-        "gsd": GSD,
-        "tile": TILE,
-        "margin": MARGIN,
-        "input": {"channels": "RGB", "scale": 1.0, "mean": [0.0, 0.0, 0.0], "std": [1.0, 1.0, 1.0]},
-        "thresholds": {"roof": 0.5, "marker": 0.5, "min_area": 6, "corner": 0.5, "corner_radius": 3.0},
-        "trained_on": {"data": ["toy"], "licence": "CC0-1.0", "view_elevation": [50, 90]},
+def make_scene(
+    folder: Path,
+    direction: tuple[float, float] | None = (181.1, 59.3),
+    projection_height: float | None = None,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+) -> Scene:
+    """Write `scene.json`, `dtm.tif` and a plain raster of `size` (px); return the scene."""
+    folder.mkdir(parents=True, exist_ok=True)
+    width, height = size
+    raster = folder / "raster.tif"
+    rows, cols = np.mgrid[:height, :width]
+    rgb = np.stack([90 + cols % 40, 110 + rows % 40, 80 + (rows + cols) % 30]).astype(np.uint8)
+    transform = Affine(GSD, 0, X0, 0, -GSD, Y0)
+    shape = {"driver": "GTiff", "count": 3, "height": height, "width": width, "crs": CRS}
+    with rasterio.open(raster, "w", dtype="uint8", transform=transform, **shape) as target:
+        target.write(rgb)
+
+    step, around = 5.0, 300.0
+    n_cols, n_rows = (int((side * GSD + 2 * around) / step) for side in size)
+    x = X0 - around + (np.arange(n_cols) + 0.5) * step
+    y = Y0 + around - (np.arange(n_rows) + 0.5) * step
+    heights = GROUND.at(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
+    transform = Affine(step, 0, X0 - around, 0, -step, Y0 + around)
+    shape = {"driver": "GTiff", "count": 1, "height": n_rows, "width": n_cols, "crs": CRS}
+    with rasterio.open(folder / "dtm.tif", "w", dtype="float32", transform=transform, **shape) as target:
+        target.write(heights, 1)
+
+    angles = direction and {
+        "azimuth": direction[0],
+        "elevation": direction[1],
+        "lean": list(view.lean(*direction)),
     }
-    if task == "corners":
-        keep = [None, None, None]
-        base["blend"] = {"inside": keep, "rim": keep, "outside": keep}
-        edges = [c - 0.5 for c in CENTRES] + [CENTRES[-1] + 0.5]
-        base["heights"] = {"edges": edges, "centres": CENTRES, "fallback": 6.0, "fallback_sigma": 2.0}
-    return {**base, **changes}
-
-
-def save(
-    nodes: list, constants: dict[str, np.ndarray], outputs: dict[str, list], path: Path, terms: dict | None
-) -> Path:
-    """Write an ONNX model of one image input."""
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, TILE, TILE])
-    out = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in outputs.items()]
-    init = [numpy_helper.from_array(np.asarray(v), k) for k, v in constants.items()]
-    model = helper.make_model(
-        helper.make_graph(nodes, "toy", [image], out, init), opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    store.write_json(
+        folder / "scene.json",
+        {
+            "name": "toy",
+            "raster": str(raster),
+            "bands": [1, 2, 3],
+            "stretch": None,
+            "grid": {"crs": CRS, "x0": X0, "y0": Y0, "gsd": GSD, "width": width, "height": height},
+            "view": angles,
+            "sun": None,
+            "projection_height": projection_height,
+            "nodata": None,
+            "convergence": 0.0,
+        },
     )
-    if terms is not None:
-        helper.set_model_props(model, {"kibs": json.dumps(terms)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    onnx.save(model, path)
-    return path
+    return scenes.read(folder / "scene.json")
 
 
-def sections_model(path: Path, terms: dict | None = None) -> Path:
-    """Roof where red is high; edge where the colour changes within 3×3 px; distance 1 away from edges."""
-    n = helper.make_node
-    pool = {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1]}
-    nodes = [
-        n("Slice", ["image", "i0", "i1", "axis"], ["red"]),
-        n("Sub", ["red", "level"], ["red0"]),
-        n("Sigmoid", ["red0"], ["roof"]),
-        n("Slice", ["image", "i1", "i2", "axis"], ["green"]),
-        n("MaxPool", ["green"], ["high"], **pool),
-        n("Neg", ["green"], ["minus"]),
-        n("MaxPool", ["minus"], ["low"], **pool),
-        n("Add", ["high", "low"], ["range"]),
-        n("Clip", ["range", "zero", "one"], ["edge"]),
-        n("Sub", ["one", "edge"], ["inner"]),
-        n("Mul", ["inner", "roof"], ["distance"]),
-    ]
-    ints = {"i0": [0], "i1": [1], "i2": [2], "axis": [1]}
-    constants = {k: np.array(v, np.int64) for k, v in ints.items()}
-    constants |= {"level": np.float32(150.5), "zero": np.float32(0), "one": np.float32(1)}
-    shape = [1, 1, TILE, TILE]
-    outputs = {"roof": shape, "edge": shape, "distance": shape}
-    return save(nodes, constants, outputs, path, contract("sections") if terms is None else terms)
+def at(col: float, row: float, z: float) -> tuple[float, float, float]:
+    """A point of the map frame, from metres east and south of the scene's corner."""
+    return (X0 + col, Y0 - row, z)
 
 
-def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> Path:
-    """Corner where blue is 255 and red 0; its height is green / 8 (+ `bias` m), a triangle over the bins."""
-    n = helper.make_node
-    nodes = [
-        n("Slice", ["image", "i0", "i1", "axis"], ["red"]),
-        n("Slice", ["image", "i1", "i2", "axis"], ["green"]),
-        n("Slice", ["image", "i2", "i3", "axis"], ["blue"]),
-        n("Sub", ["blue", "red"], ["difference"]),
-        n("Sub", ["difference", "level"], ["excess"]),
-        n("Sigmoid", ["excess"], ["corner"]),
-        n("Concat", ["zeros", "zeros"], ["offset"], axis=1),
-        n("Mul", ["green", "eighth"], ["metres0"]),
-        n("Add", ["metres0", "bias"], ["metres"]),
-        n("Sub", ["metres", "centres"], ["away"]),
-        n("Abs", ["away"], ["apart"]),
-        n("Sub", ["one", "apart"], ["peak"]),
-        n("Relu", ["peak"], ["height"]),
-    ]
-    constants = {k: np.array([i], np.int64) for i, k in enumerate(("i0", "i1", "i2", "i3"))}
-    constants |= {
-        "axis": np.array([1], np.int64),
-        "level": np.float32(250),
-        "eighth": np.float32(1 / 8),
-        "bias": np.float32(bias),
-        "one": np.float32(1),
-        "centres": np.array(CENTRES, np.float32).reshape(1, -1, 1, 1),
-        "zeros": np.zeros((1, 1, TILE, TILE), np.float32),
-    }
-    outputs = {
-        "corner": [1, 1, TILE, TILE],
-        "offset": [1, 2, TILE, TILE],
-        "height": [1, len(CENTRES), TILE, TILE],
-    }
-    return save(nodes, constants, outputs, path, contract("corners") if terms is None else terms)
+def roofs() -> list[tuple[int, int, shapely.Polygon]]:
+    """(section, building, outline in the map frame with absolute z) of the toy city."""
+    eave, ridge = 20.0, 25.0
+    gable_north = shapely.Polygon([at(30, 30, eave), at(30, 35, ridge), at(50, 35, ridge), at(50, 30, eave)])
+    gable_south = shapely.Polygon([at(30, 35, ridge), at(30, 40, eave), at(50, 40, eave), at(50, 35, ridge)])
+    ring = [at(80, 60, 40), at(80, 90, 40), at(110, 90, 40), at(110, 60, 40)]
+    court = [at(90, 70, 40), at(100, 70, 40), at(100, 80, 40), at(90, 80, 40)]
+    block = shapely.Polygon(ring, [court])
+    shed = shapely.Polygon([at(85, 42, 18), at(85, 52, 20), at(105, 52, 20), at(105, 42, 18)])
+    found = [(11, 11, gable_north), (12, 11, gable_south), (13, 13, block), (14, 14, shed)]
+    return [(section, building, shapely.orient_polygons(outline)) for section, building, outline in found]
 
 
-def models(folder: Path) -> Path:
-    """A model set."""
-    sections_model(folder / "sections.onnx")
-    corners_model(folder / "corners.onnx")
-    return folder
+def seen_outline(scene: Scene, outline: shapely.Polygon) -> shapely.Polygon:
+    """A standing outline as the image shows it: px, z = height above the ground."""
+    ground = scene.projected_on(GROUND.at)
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        image = view.image_position(points[:, :2], points[:, 2], scene.lean, ground)
+        return np.column_stack([scene.grid.to_image(image), points[:, 2] - GROUND.at(points[:, :2])])
+
+    return shapely.transform(outline, moved, include_z=True)
 
 
-def houses(rng: np.random.Generator, width: int, height: int) -> list[Section]:
-    """Houses of two sections with a common ridge, never touching each other; heights in eighths of a metre."""
-    found: list[Section] = []
-    for row in range(4, height - 30, 30):
-        for col in range(4, width - 36, 36):
-            w, h = int(rng.integers(14, 28)), int(rng.integers(12, 22))
-            left, top = col + int(rng.integers(0, 6)), row + int(rng.integers(0, 6))
-            eave, rise, half = float(rng.integers(3, 8)), float(rng.integers(1, 4)), h // 2
-            ridge = eave + rise
-            green = int(rng.integers(40, 90))
-            found.append((left, top, w, half, green, (eave, eave, ridge, ridge)))
-            found.append((left, top + half, w, h - half, green + 60, (ridge, ridge, eave, eave)))
-    return found
+def plane_through(outline: shapely.Polygon) -> view.Plane:
+    """The plane of a planar outline."""
+    points = shapely.get_coordinates(outline, include_z=True)
+    x0, y0, c = points[0]
+    a, b = np.linalg.lstsq(points[:, :2] - (x0, y0), points[:, 2] - c, rcond=None)[0]
+    return view.Plane(float(a), float(b), float(c), float(x0), float(y0))
 
 
-def paint(sections: list[Section], width: int, height: int) -> np.ndarray:
-    """The raster (height, width, 3) uint8: corner pixels just inside each section's four corners."""
-    image = np.full((height, width, 3), (90, 110, 80), np.uint8)
-    for col, row, w, h, green, _ in sections:
-        image[row : row + h, col : col + w] = (200, green, 60)
-    for col, row, w, h, _, (z0, z1, z2, z3) in sections:
-        for c, r, z in ((col, row, z0), (col + w - 1, row, z1), (col + w - 1, row + h - 1, z2), (col, row + h - 1, z3)):
-            image[r, c] = (0, round(8 * z), 255)
-    return image
+def buildings_table(scene: Scene, found: list[tuple[int, int, shapely.Polygon]] | None = None) -> pa.Table:
+    """`buildings.parquet` of roofs, as a perfect run would write it."""
+    found = roofs() if found is None else found
+    rows = []
+    for section, building, outline in found:
+        seen = seen_outline(scene, outline)
+        heights = shapely.get_coordinates(seen, include_z=True)[:, 2]
+        map_seen = shapely.transform(
+            seen, lambda p: np.column_stack([scene.grid.to_map(p[:, :2]), p[:, 2]]), include_z=True
+        )
+        plane = plane_through(outline)
+        slope = float(np.degrees(np.arctan(np.hypot(plane.a, plane.b))))
+        rows.append(
+            {
+                "section_id": section,
+                "outline": shapely.to_wkb(shapely.force_2d(seen)),
+                "outline_seen": shapely.to_wkb(map_seen),
+                "outline_map": shapely.to_wkb(outline),
+                "status": "ok",
+                "status_reason": "",
+                "height_min": heights.min(),
+                "height_max": heights.max(),
+                "height_mean": heights.mean(),
+                "height_sigma": 0.5,
+                "slope": slope,
+                "azimuth": None if slope < 3 else float(np.degrees(np.arctan2(-plane.a, -plane.b)) % 360),
+                "plane_a": plane.a,
+                "plane_b": plane.b,
+                "plane_c": plane.c,
+                "x0": plane.x0,
+                "y0": plane.y0,
+                "n_corners": 4,
+                "score": 0.9,
+                "area": outline.area,
+                "split": section % 3,
+                "building_id": building,
+            }
+        )
+    return pa.Table.from_pylist(rows)
 
 
-def raster(path: Path, image: np.ndarray) -> Path:
-    """Write the image as a georeferenced GeoTIFF."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "height": image.shape[0], "width": image.shape[1]}
-    with rasterio.open(path, "w", **profile, crs="EPSG:32631", transform=Affine(GSD, 0, X0, 0, -GSD, Y0)) as target:
-        target.write(image.transpose(2, 0, 1))
-    return path
+def truth_table(scene: Scene, found: list[tuple[int, int, shapely.Polygon]] | None = None) -> pa.Table:
+    """`truth.parquet` of roofs."""
+    found = roofs() if found is None else found
+    return pa.table(
+        {
+            "truth_id": pa.array([section for section, _, _ in found], pa.int64()),
+            "building": pa.array([building for _, building, _ in found], pa.int64()),
+            "outline_seen": pa.array([shapely.to_wkb(seen_outline(scene, o)) for _, _, o in found], pa.binary()),
+            "outline_map": pa.array([shapely.to_wkb(o) for _, _, o in found], pa.binary()),
+            "split": pa.array([section % 3 for section, _, _ in found], pa.int64()),
+            "visible": pa.array([None] * len(found), pa.float64()),
+        }
+    )
