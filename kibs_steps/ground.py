@@ -74,7 +74,7 @@ def ground(planes: pa.Table, facts: scene.Scene, dtm: view.Surface) -> pa.Table:
     np.maximum.at(high, index, height)
     centre = shapely.get_coordinates(shapely.centroid(outline_map)) if n else np.zeros((0, 2))
     middle = view.Plane(*column.values()).at(centre) - dtm(centre)
-    slope, azimuth = slope_azimuth(column["plane_a"], column["plane_b"], facts.convergence)
+    slope, azimuth = slope_azimuth(column["plane_a"], column["plane_b"], scene.convergence(facts.grid))
     values = {
         "outline_seen": shapely.to_wkb(outline_seen, output_dimension=3),
         "outline_map": shapely.to_wkb(outline_map, output_dimension=3),

@@ -53,6 +53,15 @@ class Plan(NamedTuple):
     signature: dict[str, str]
 
     @property
+    def terrain_files(self) -> list[str]:
+        """The terrain file, or nothing where the terrain is a number."""
+        try:
+            float(self.dtm)
+        except ValueError:
+            return [self.dtm]
+        return []
+
+    @property
     def reach(self) -> float:
         """How far a corner may lie from its section, px."""
         return self.models["corners"].contract["thresholds"].get("corner_radius", REACH)

@@ -40,8 +40,10 @@ PLANE_FIELDS += [("status", pa.string()), ("status_reason", pa.string())]
 
 
 class Points(NamedTuple):
-    """Corners in the map frame: x, y, z (m, absolute), height above ground (m) and σ (m)."""
+    """Corners where they are seen, col, row (px), and where they stand, x, y, z (map, m, absolute); height above ground, σ (m)."""
 
+    col: np.ndarray
+    row: np.ndarray
     x: np.ndarray
     y: np.ndarray
     z: np.ndarray
@@ -129,7 +131,7 @@ def robust_plane(points: Points, middle: np.ndarray) -> tuple[Plane, float]:
 
 
 def largest_triangle(x: np.ndarray, y: np.ndarray) -> tuple[tuple[int, int, int], float]:
-    """The three of n ≥ 3 points with the largest triangle, and its area (m²); ties go to the first.
+    """The three of n ≥ 3 points with the largest triangle, and its area; ties go to the first.
 
     Its corners lie on the convex hull, so only those are tried.
     """
@@ -177,7 +179,7 @@ def fit(
 ) -> Fit:
     """A section's plane from its corners.
 
-    `area` m² of the section in plan, `middle` (2,) map m, `ground` DTM there (m), `fallback` the model's mean height and σ
+    `area` px² of the section as seen, `middle` (2,) map m, `ground` DTM there (m), `fallback` the model's mean height and σ
     (m above ground), `rule` robust or paper.
     """
     n = len(points.z)
@@ -189,7 +191,7 @@ def fit(
         status = "one_corner" if n == 1 else "two_corners"
         reason = f"{'one corner gives' if n == 1 else 'two corners give'} a level plane at the mean height"
         return Fit(flat(ground + points.height.mean(), middle), sigma, status, reason)
-    triple, triangle = largest_triangle(points.x, points.y)
+    triple, triangle = largest_triangle(points.col, points.row)
     share = triangle / max(area, 1e-9)
     plane, sigma = robust_plane(points, middle)
     trusted = share >= TRIANGLE[0] and (share <= TRIANGLE[1] or rule == "robust")
@@ -247,7 +249,7 @@ def planes(
     height = corners["height"].to_numpy()
     base = facts.projected_on(dtm)
     where, z = view.ground_position(facts.grid.to_map(pixel), height, dtm, facts.lean, base)
-    points = Points(where[:, 0], where[:, 1], z, height, corners["sigma"].to_numpy())
+    points = Points(*pixel.T, where[:, 0], where[:, 1], z, height, corners["sigma"].to_numpy())
     shared = SHARED if rule == "robust" else 0.0
     section, corner = file_corners(
         outlines, pixel, corners["owner"].to_numpy(), sections["owner"].to_numpy(), reach, shared
@@ -264,7 +266,7 @@ def planes(
         typical = float(np.median(mine.height)) if len(mine.z) else fallback[0]
         middle, _ = view.ground_position(centre[i : i + 1], np.array([typical]), dtm, facts.lean, base)
         ground = float(dtm(middle)[0])
-        found = fit(mine, area_px[i] * facts.grid.gsd**2, middle[0], ground, fallback, rule)
+        found = fit(mine, area_px[i], middle[0], ground, fallback, rule)
         found = checked(found, mine, area_px[i], ground, middle[0], edge[i], void[i])
         rows.append([*found.plane, found.sigma, len(mine.z), found.status, found.reason])
     table = sections.select(["section_id", "outline", "score", "split"])

@@ -1,19 +1,18 @@
 """Corners to planes: closed-form roofs, the paper's rules, statuses, filing hazards."""
 
 import numpy as np
-import pyarrow as pa
 import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kibs_steps import planes, terrain, view
+from kibs_steps import planes, view
 from kibs_steps.planes import Points
 
 
 def points(xyz, sigma=0.5, ground=0.0):
     x, y, z = np.asarray(xyz, float).T
-    return Points(x, y, z, z - ground, np.full(len(x), sigma))
+    return Points(x, y, x, y, z, z - ground, np.full(len(x), sigma))
 
 
 SLOPE = view.Plane(0.3, -0.4, 7.0, 0.0, 0.0)
@@ -98,7 +97,10 @@ def test_largest_triangle_is_the_largest(xy):
     from itertools import combinations
 
     x, y = np.array(xy).T
-    best = max(abs((x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])) / 2 for a, b, c in combinations(range(len(x)), 3))
+    best = max(
+        abs((x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])) / 2
+        for a, b, c in combinations(range(len(x)), 3)
+    )
     _, area = planes.largest_triangle(x, y)
     assert area == pytest.approx(best, rel=1e-6, abs=1e-6)
 
@@ -118,7 +120,9 @@ def test_filing_of_heights(heights):
 
 def filed(outlines, corners, reach=7.5, shared=2.0):
     none = np.zeros(len(corners), int)
-    section, corner = planes.file_corners(np.array(outlines), np.array(corners, float), none, np.zeros(len(outlines), int), reach, shared)
+    section, corner = planes.file_corners(
+        np.array(outlines), np.array(corners, float), none, np.zeros(len(outlines), int), reach, shared
+    )
     return list(zip(section.tolist(), corner.tolist(), strict=True))
 
 
@@ -173,22 +177,3 @@ def test_implausible_slope_is_made_level():
     result = planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, False, False)
     assert result.status == "implausible_slope"
     assert (result.plane.a, result.plane.b) == (0, 0)
-
-
-def table_of(outlines):
-    n = len(outlines)
-    return pa.table(
-        {
-            "section_id": np.arange(1, n + 1),
-            "outline": shapely.to_wkb(np.array(outlines)),
-            "score": np.ones(n),
-            "split": np.full(n, 2),
-            "edge": np.zeros(n, bool),
-            "void": np.zeros(n, bool),
-            "owner": np.arange(1, n + 1),
-        }
-    )
-
-
-def test_terrain_flat_reads_constant():
-    assert (terrain.flat(12.5)(np.zeros((3, 2))) == 12.5).all()

@@ -128,10 +128,12 @@ rule stitch:
         signature=signature("stitch"),
         tiling=lambda w: plan(w).tiling,
         tolerance=lambda w: plan(w).tolerance,
+        reach=lambda w: plan(w).reach,
         folders=lambda w: [
             f"results/{w.scene}/blocks/{b.name}/{source(w)}" for b in plan(w).blocks
         ],
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"
+        " --reach {params.reach}"
         " --folders {params.folders:q} --sections {output.sections:q} --corners {output.corners:q} > {log:q} 2>&1"

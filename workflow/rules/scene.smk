@@ -27,7 +27,7 @@ rule scene:
     """Check the raster and the terrain once, and write what every later step needs to know."""
     input:
         raster=lambda w: ancient(plan(w).raster),
-        dtm=lambda w: ancient(plan(w).dtm) if not is_number(plan(w).dtm) else [],
+        dtm=lambda w: ancient(plan(w).terrain_files),
     output:
         scene="results/{scene}/scene.json",
         dtm="results/{scene}/dtm.tif",
