@@ -132,7 +132,7 @@ def render_faces(faces: Sequence[Polygon], k: tuple[float, float], frame: Grid, 
     spans = _spans(seen_start[edges], seen_end[edges], owner[edges], frame.width, frame.height)
     total = np.cumsum(spans[3] - spans[2])
     cuts = np.searchsorted(total, np.arange(FRAGMENTS, total[-1] if len(total) else 0, FRAGMENTS))
-    bits = int(len(faces)).bit_length()
+    bits = len(faces).bit_length()
     for face, row, first, past in zip(*(np.split(s, cuts) for s in spans), strict=True):
         length = past - first
         run = np.repeat(np.arange(len(face)), length)

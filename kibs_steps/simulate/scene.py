@@ -17,14 +17,16 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from kibs_steps import cli, store, zbuffer
 from kibs_steps import view as geometry
-from kibs_steps import zbuffer
+from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid
-from kibs_steps.scene import Direction
+from kibs_steps.scene import Direction, convergence
 from kibs_steps.simulate import camera, light
 from kibs_steps.simulate.city import CLUTTER, ROOF, STYLES, City, procedural
 from kibs_steps.terrain import Terrain, flat
 
+STRIP = 256  # rows shaded at a time
 BIAS = 0.2  # m: a face this little above another does not shade it
 
 
@@ -173,25 +175,7 @@ def render(
     samples = _sample_frame(grid)
     city = _near(city, terrain, samples, view.lean, sun.lean)
     seen = _see(city, terrain, samples, view.lean)
-    table = light.surfaces(city.faces, city.paints, city.materials, rng)
-    index = np.where(seen.face >= 0, seen.face, len(city.faces) + _paint(city, samples)).ravel()
-    source = light.light(sun.lean, rng)
-    normal = table.normal[index]
-    facing = (normal @ source.direction.astype(np.float32) > 0).reshape(seen.face.shape)
-    leafy = table.leafy[index]
-    lit = _lit(city, seen, samples, sun.lean, facing | leafy.reshape(facing.shape)).ravel()
-    points = (seen.points - [grid.x0, grid.y0 - grid.height * grid.gsd, 0]).astype(np.float32)
-    table = table._replace(
-        origin=table.origin
-        - np.array([grid.x0, grid.y0 - grid.height * grid.gsd, 0])
-        * (np.arange(len(table.origin)) < len(city.faces))[:, None]
-    )
-    table = table._replace(origin=table.origin.astype(np.float32))
-    colour = light.albedo(index, points.reshape(-1, 3), table, city.materials, rng)
-    if backgrounds:
-        colour = _over_photograph(colour, (seen.face < 0).ravel(), seen.face.shape, backgrounds, grid.gsd, rng)
-    sky = light.openness(seen.points[..., 2] - seen.ground, samples.gsd).ravel()
-    shine = light.radiance(colour, normal, leafy, lit, sky, source).reshape(*seen.face.shape, 3).astype(np.float32)
+    shine = _shine(city, seen, samples, sun, rng, backgrounds)
     rgb = camera.photograph(shine, look or camera.camera(rng), rng)
 
     at = np.s_[1::2, 1::2]
@@ -207,6 +191,43 @@ def render(
     sections = _truth(city, terrain, grid, view.lean, seen.section)
     corners = _corners(sections, section)
     return Rendering(rgb, section, height, sections, *corners)
+
+
+def _shine(
+    city: City,
+    seen: _Seen,
+    samples: Grid,
+    sun: Direction,
+    rng: np.random.Generator,
+    backgrounds: list[tuple[np.ndarray, np.ndarray]] | None,
+) -> np.ndarray:
+    """Radiance (rows, cols, 3) float32 of all samples, worked out in strips of rows to bound the memory."""
+    # Textures in float32 need small coordinates: an origin near by.
+    origin = np.array([samples.x0, samples.y0, 0.0])
+    near = city._replace(faces=[f._replace(ring=f.ring - origin) for f in city.faces])
+    table = light.surfaces(near.faces, city.paints, city.materials, rng)
+    source = light.light(sun.lean, rng)
+    toward = source.direction.astype(np.float32)
+    shape = seen.face.shape
+    index = np.where(seen.face >= 0, seen.face, len(city.faces) + _paint(city, samples))
+    facing = (table.normal @ toward > 0) | table.leafy
+    lit = _lit(city, seen, samples, sun.lean, facing[index])
+    sky = light.openness((seen.points[..., 2] - seen.ground).astype(np.float32), samples.gsd)
+    photograph = _photograph(shape, backgrounds, rng) if backgrounds else None
+    shine = np.empty((*shape, 3), np.float32)
+    for start in range(0, shape[0], STRIP):
+        rows = np.s_[start : start + STRIP]
+        which = index[rows].ravel()
+        points = (seen.points[rows] - origin).astype(np.float32).reshape(-1, 3)
+        colour = light.albedo(which, points, table, city.materials, rng)
+        if photograph:
+            chosen = (which >= len(city.faces)) & photograph[1][rows].ravel()
+            colour[chosen] = photograph[0][rows].reshape(-1, 3)[chosen]
+        light_here = light.radiance(
+            colour, table.normal[which], table.leafy[which], lit[rows].ravel(), sky[rows].ravel(), source
+        )
+        shine[rows] = light_here.reshape(-1, shape[1], 3)
+    return shine
 
 
 def _near(city: City, terrain: Terrain, samples: Grid, view: tuple[float, float], sun: tuple[float, float]) -> City:
@@ -228,33 +249,24 @@ def _near(city: City, terrain: Terrain, samples: Grid, view: tuple[float, float]
     return city._replace(faces=[city.faces[i] for i in np.flatnonzero(near)])
 
 
-def _over_photograph(
-    colour: np.ndarray,
-    ground: np.ndarray,
-    shape: tuple[int, int],
-    backgrounds: list[tuple[np.ndarray, np.ndarray]],
-    gsd: float,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Albedo with a photograph laid over the ground where it is usable."""
+def _photograph(
+    shape: tuple[int, int], backgrounds: list[tuple[np.ndarray, np.ndarray]], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """A photograph as albedo (rows, cols, 3) float32 of the samples, turned and scaled at random, and where it is usable."""
     picture, usable = backgrounds[int(rng.integers(len(backgrounds)))]
-    k = int(rng.integers(4))
-    picture, usable = np.rot90(picture, k), np.rot90(usable, k)
+    turn = int(rng.integers(4))
+    picture, usable = np.rot90(picture, turn), np.rot90(usable, turn)
     if rng.random() < 0.5:
         picture, usable = picture[:, ::-1], usable[:, ::-1]
     scale = rng.uniform(1.6, 2.6)
     need = np.array(shape) / scale
     row, col = (int(rng.integers(0, max(1, int(have - want)))) for have, want in zip(usable.shape, need, strict=True))
-    centre = np.array([[scale, 0, -scale * col], [0, scale, -scale * row]], np.float32)
+    onto = np.array([[scale, 0, -scale * col], [0, scale, -scale * row]], np.float32)
     size = (shape[1], shape[0])
-    laid = cv2.warpAffine(
-        np.ascontiguousarray(picture), centre, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-    )
-    mask = cv2.warpAffine(np.ascontiguousarray(usable).astype(np.uint8), centre, size, flags=cv2.INTER_NEAREST)
-    chosen = ground & (mask.ravel() > 0)
-    colour = colour.copy()
-    colour[chosen] = 0.75 * (laid.reshape(-1, 3)[chosen].astype(np.float32) / 255) ** np.float32(rng.uniform(1.4, 2.2))
-    return colour
+    laid = cv2.warpAffine(np.ascontiguousarray(picture), onto, size, flags=cv2.INTER_LINEAR)
+    mask = cv2.warpAffine(np.ascontiguousarray(usable).astype(np.uint8), onto, size, flags=cv2.INTER_NEAREST) > 0
+    albedo = 0.75 * (laid.astype(np.float32) / 255) ** np.float32(rng.uniform(1.4, 2.2))
+    return albedo, mask
 
 
 def _truth(city: City, terrain: Terrain, grid: Grid, k: tuple[float, float], seen: np.ndarray) -> list[SectionTruth]:
@@ -368,3 +380,163 @@ def random_scene(
     city = procedural(rng, side + 2 * margin, side + 2 * margin, terrain, style, (-margin, -margin))
     picture = render(city, terrain, grid, view, sun, rng, backgrounds if rng.random() < 0.5 else None)
     return picture, geometry_vector(view, sun, gsd)
+
+
+def simulate(
+    seed: int,
+    grid: Grid,
+    view: Direction,
+    sun: Direction,
+    style: str = "mixed",
+    amplitude: float = 0.0,
+    slope: float = 0.0,
+    base: float = 100.0,
+) -> tuple[Rendering, Terrain]:
+    """One scene over `grid`: its rendering and its terrain (2 m posting, 250 m beyond the grid).
+
+    `amplitude` (m) and `slope` (m/m) shape the terrain, `base` (m) is its mean height.
+    """
+    rng = np.random.default_rng(seed)
+    left, bottom, right, top = grid.bounds
+    terrain = relief(rng, (left - 250, bottom - 250, right + 250, top + 250), 2.0, amplitude, slope, base)
+    margin = 60.0
+    city = procedural(
+        rng, right - left + 2 * margin, top - bottom + 2 * margin, terrain, style, (left - margin, bottom - margin)
+    )
+    return render(city, terrain, grid, view, sun, rng), terrain
+
+
+def split_of(x_y: np.ndarray, seed: int) -> int:
+    """Split of a building by the 100 m square it stands in: 0 training (60 %), 1 validation, 2 testing (20 % each)."""
+    square = np.floor(np.asarray(x_y) / 100.0).astype(int).tolist()
+    return int(np.searchsorted([0.6, 0.8], np.random.default_rng([seed, *square]).random(), side="right"))
+
+
+def _write_truth(path: Path, picture: Rendering, grid: Grid, seed: int) -> None:
+    import geopandas
+    import pyogrio
+    import shapely
+
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": "2000-01-01T00:00:00.000Z"})
+    splits: dict[int, int] = {}
+    for s in picture.sections:
+        splits.setdefault(s.building, split_of(s.outline_map[0, :2], seed))
+    columns = {
+        "section_id": [s.section for s in picture.sections],
+        "building_id": [s.building for s in picture.sections],
+        "visible": [s.visible for s in picture.sections],
+        "split": [splits[s.building] for s in picture.sections],
+    }
+
+    def seen(ring: np.ndarray) -> np.ndarray:
+        return np.column_stack([grid.to_map(ring[:, :2]), ring[:, 2]])
+
+    layers = {
+        "sections_image": [
+            shapely.Polygon(seen(s.outline_seen), [seen(h) for h in s.holes_seen]) for s in picture.sections
+        ],
+        "sections_map": [shapely.Polygon(s.outline_map, list(s.holes_map)) for s in picture.sections],
+    }
+    with store.whole(path) as temporary:
+        temporary.unlink()
+        for name, shapes in layers.items():
+            frame = geopandas.GeoDataFrame(columns, geometry=shapes, crs=grid.crs)
+            pyogrio.write_dataframe(
+                frame, temporary, layer=name, driver="GPKG", geometry_type="Polygon Z", append=name != "sections_image"
+            )
+
+
+def _write_raster(path: Path, values: np.ndarray, crs: str, x0: float, y0: float, step: float) -> None:
+    import rasterio
+    from affine import Affine
+
+    bands = np.atleast_3d(values).transpose(2, 0, 1) if values.ndim == 3 else values[None]
+    with (
+        store.whole(path) as temporary,
+        rasterio.open(
+            temporary,
+            "w",
+            driver="GTiff",
+            count=len(bands),
+            height=bands.shape[1],
+            width=bands.shape[2],
+            dtype=bands.dtype,
+            crs=crs,
+            transform=Affine(step, 0, x0, 0, -step, y0),
+            tiled=True,
+            blockxsize=256,
+            blockysize=256,
+            compress="deflate",
+            photometric="RGB" if len(bands) == 3 else "MINISBLACK",
+        ) as target,
+    ):
+        target.write(bands)
+
+
+def _origin(crs: str, gsd: float) -> tuple[float, float]:
+    """An upper-left corner near the centre of a CRS's area of use, on a multiple of the GSD (millimetres kept)."""
+    import pyproj
+
+    try:
+        system = pyproj.CRS(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise UnusableScene(
+            f"--crs {crs} is not a coordinate reference system: give one in metres, such as EPSG:32631"
+        ) from error
+    if not system.is_projected or abs(system.axis_info[0].unit_conversion_factor - 1) > 1e-9:
+        raise UnusableScene(f"--crs {crs} is not projected in metres: give a UTM zone, such as EPSG:32631")
+    west, south, east, north = system.area_of_use.bounds if system.area_of_use else (2.0, 48.0, 4.0, 50.0)
+    latitude = 49.2 if south < 49.2 < north else (south + north) / 2
+    x, y = pyproj.Transformer.from_crs(system.geodetic_crs, system, always_xy=True).transform(
+        (west + east) / 2 + 0.02, latitude
+    )
+    return round(round(x / gsd) * gsd, 3), round(round(y / gsd) * gsd, 3)
+
+
+class UnusableScene(KibsError):
+    """A scene that cannot be simulated as asked."""
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Simulate one scene and write its raster, terrain, truth and angles."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--size", type=int, default=1200, help="pixels per side")
+    parser.add_argument("--gsd", type=float, default=0.38, help="metres per pixel")
+    parser.add_argument("--view-azimuth", type=float, default=181.1, help="degrees from true north, to the satellite")
+    parser.add_argument("--view-elevation", type=float, default=59.3, help="degrees above the horizon")
+    parser.add_argument("--sun-azimuth", type=float, default=155.0)
+    parser.add_argument("--sun-elevation", type=float, default=45.0)
+    parser.add_argument("--style", choices=[*STYLES, "mixed"], default="mixed")
+    parser.add_argument("--relief", type=float, default=0.0, help="amplitude of the terrain's waves in metres")
+    parser.add_argument("--slope", type=float, default=0.0, help="slope of the terrain in percent")
+    parser.add_argument("--crs", default="EPSG:32631", help="a projected CRS in metres")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write to")
+    args = parser.parse_args(argv)
+    if args.size < 1 or not args.gsd > 0:
+        raise UnusableScene("--size and --gsd must be positive")
+    for name, least in (("view", 20), ("sun", 5)):
+        if not least <= getattr(args, f"{name}_elevation") <= 90:
+            raise UnusableScene(f"--{name}-elevation must be between {least} and 90 degrees")
+    grid = Grid(args.crs, *_origin(args.crs, args.gsd), args.gsd, args.size, args.size)
+    turned = convergence(grid)
+    view = _direction(args.view_azimuth, args.view_elevation, turned)
+    sun = _direction(args.sun_azimuth, args.sun_elevation, turned)
+    picture, terrain = simulate(args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0)
+    step = terrain.step[0]
+    _write_raster(args.out / "scene.tif", picture.rgb, args.crs, grid.x0, grid.y0, grid.gsd)
+    _write_raster(
+        args.out / "dtm.tif",
+        terrain.heights.astype(np.float32),
+        args.crs,
+        terrain.x0 - step / 2,
+        terrain.y0 + step / 2,
+        step,
+    )
+    _write_truth(args.out / "truth.gpkg", picture, grid, args.seed)
+    angles = {name: getattr(args, name) for name in ("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation")}
+    store.write_json(args.out / "angles.json", angles)
+
+
+if __name__ == "__main__":
+    cli.run(main)
