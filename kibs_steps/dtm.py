@@ -57,14 +57,14 @@ class Canvas(NamedTuple):
     rows: Callable[[int, int], np.ndarray]
 
 
-def write(dtm: str | float, grid: Grid, footprint: np.ndarray, path: str | Path) -> dict:
+def write(dtm: str | Path | float, grid: Grid, footprint: np.ndarray, path: str | Path) -> dict:
     """Write `dtm.tif` for a scene of that grid, whose raster covers the ring `footprint` (n, 2 map metres).
 
     Returns the record for `scene.json`: `source`, `step` (m) and `filled`, the share of the footprint without own data.
     Raises `DtmMissing`, `DtmPartial` (with the uncovered share), `DtmAbsurd`.
     """
     try:
-        height = float(dtm)
+        height = float(str(dtm))
     except ValueError:
         with _opened(str(dtm)) as source, _canvas(source, grid) as canvas:
             area = _covered_area(source, grid, footprint, canvas)
@@ -158,6 +158,9 @@ def _canvas(source: rasterio.DatasetReader, grid: Grid):
         width=width,
         height=height,
         resampling=Resampling.bilinear,
+        tolerance=0.001,
+        XSCALE=1.0,  # plain bilinear: GDAL would smooth where the CRSs are turned to each other
+        YSCALE=1.0,
         src_nodata=nodata,
         nodata=np.nan,
         dtype="float64" if source.dtypes[0] == "float64" else "float32",

@@ -291,7 +291,7 @@ def facts(source: rasterio.DatasetReader, gsd: float, bands: tuple[int, ...] | N
 def build(
     name: str,
     raster: str | Path,
-    dtm: str | float,
+    dtm: str | Path | float,
     gsd: float,
     folder: str | Path,
     *,
