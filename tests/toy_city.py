@@ -85,7 +85,7 @@ def roofs() -> list[tuple[int, int, shapely.Polygon]]:
     ring = [at(80, 60, 40), at(80, 90, 40), at(110, 90, 40), at(110, 60, 40)]
     court = [at(90, 70, 40), at(100, 70, 40), at(100, 80, 40), at(90, 80, 40)]
     block = shapely.Polygon(ring, [court])
-    shed = shapely.Polygon([at(85, 42, 18), at(85, 52, 20), at(105, 52, 20), at(105, 42, 18)])
+    shed = shapely.Polygon([at(85, 42, 20), at(85, 52, 22), at(105, 52, 22), at(105, 42, 20)])
     found = [(11, 11, gable_north), (12, 11, gable_south), (13, 13, block), (14, 14, shed)]
     return [(section, building, shapely.orient_polygons(outline)) for section, building, outline in found]
 
