@@ -5,8 +5,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+# The machine's speed is no property of the code, and a failure must come back when one looks for it.
+settings.register_profile("kibs", deadline=None, derandomize=True)
+settings.load_profile("kibs")
 
 
 @pytest.fixture

@@ -39,7 +39,8 @@ def detections(image, block_side, nets, shuffle=None):
     pieces, links, seams, found = [], [], [], []
     for block in blocks:
         core = tiling.block_core(block, grid.width, grid.height)
-        window = (slice(core.row, core.row + core.height + 2 * toy.MARGIN), slice(core.col, core.col + core.width + 2 * toy.MARGIN))
+        grown = core.grown(toy.MARGIN)  # the padded image starts a margin before the raster
+        window = (slice(core.row, core.row + grown.height), slice(core.col, core.col + grown.width))
         network, terms = nets["sections"]
         views = sections.detect(padded[window], inside[window], tiling, block, grid, network, terms)
         pieces.append(sections.pieces(views, inside[window], tiling, core))

@@ -23,7 +23,7 @@ VIEW = {"view_azimuth": 181.1, "view_elevation": 59.3}
 Section = tuple[int, int, int, int, int, tuple[float, float, float, float]]  # col, row, width, height, green, heights
 
 
-def contract(task: str, **changes: object) -> dict:
+def contract(task: str, /, **changes: object) -> dict:
     """A valid contract for a toy model."""
     base = {
         "contract": 1,
@@ -44,7 +44,9 @@ def contract(task: str, **changes: object) -> dict:
     return {**base, **changes}
 
 
-def save(nodes: list, constants: dict[str, np.ndarray], outputs: dict[str, list], path: Path, terms: dict | None) -> Path:
+def save(
+    nodes: list, constants: dict[str, np.ndarray], outputs: dict[str, list], path: Path, terms: dict | None
+) -> Path:
     """Write an ONNX model of one image input."""
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, TILE, TILE])
     out = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in outputs.items()]

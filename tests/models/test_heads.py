@@ -1,0 +1,109 @@
+"""Decoding: painted truth through ideal network outputs comes back; both heads give the same kind of detections."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from kibs_steps.models import heads
+
+THRESHOLDS = {"roof": 0.5, "marker": 0.35, "min_area": 10, "corner": 0.3, "score": 0.5}
+HEIGHTS = {"edges": [0.0, 1.0, 2.0, 4.0], "centres": [0.5, 1.5, 3.0], "fallback": 2.0}
+
+
+def ideal_maps(labels, clip=4.0):
+    """What a perfect dense network would say of a label image."""
+    edge = np.zeros(labels.shape)
+    distance = np.zeros(labels.shape)
+    for label in range(1, labels.max() + 1):
+        inside = np.pad(labels == label, 1)
+        d = ndimage.distance_transform_edt(inside)[1:-1, 1:-1]
+        edge[(d > 0) & (d <= 1)] = 1
+        distance = np.maximum(distance, np.minimum(d / clip, 1))
+    return (labels > 0).astype(float), edge, distance
+
+
+def test_adjacent_sections_come_back_apart():
+    labels = np.zeros((64, 64), int)
+    labels[8:30, 10:40] = 1
+    labels[30:50, 10:40] = 2
+    labels[55:60, 50:60] = 3
+    found = heads.dense_sections(*ideal_maps(labels), THRESHOLDS)
+    assert found.labels.max() == 3
+    for label in (1, 2, 3):
+        values, counts = np.unique(found.labels[labels == label], return_counts=True)
+        assert counts.max() == (labels == label).sum()
+        assert (found.labels == values[np.argmax(counts)]).sum() == (labels == label).sum()
+    np.testing.assert_allclose(found.scores, 1)
+
+
+def test_thin_roof_without_marker_is_a_section():
+    labels = np.zeros((32, 32), int)
+    labels[10:12, 4:28] = 1
+    found = heads.dense_sections(*ideal_maps(labels, 8.0), THRESHOLDS)
+    np.testing.assert_array_equal(found.labels, labels)
+
+
+def test_specks_are_absorbed_or_dropped():
+    labels = np.zeros((32, 32), int)
+    labels[5:25, 5:20] = 1
+    labels[5:8, 20:22] = 2
+    labels[29:31, 29:31] = 3
+    found = heads.absorb_small(labels, 10)
+    assert found.max() == 1
+    assert (found[5:8, 20:22] == 1).all()
+    assert found[29, 29] == 0
+
+
+def test_no_roof_no_sections():
+    zero = np.zeros((16, 16))
+    found = heads.dense_sections(zero, zero, zero, THRESHOLDS)
+    assert found.labels.max() == 0
+    assert len(found.scores) == 0
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_corner_position_and_height(stride):
+    """A peak moved by the offset map; the height is the mean of the distribution there, σ includes the bins' width."""
+    corner = np.zeros((32, 32))
+    corner[10, 20], corner[10, 21] = 0.9, 0.5
+    offset = np.zeros((2, 32, 32))
+    offset[:, 10, 20] = 0.3, -0.2
+    height = np.zeros((3, 32 // stride, 32 // stride))
+    height[0], height[1] = 0.25, 0.75
+    found = heads.dense_corners(corner, offset, height, HEIGHTS, THRESHOLDS)
+    assert (found.col.tolist(), found.row.tolist()) == ([pytest.approx(20.8)], [pytest.approx(10.3)])
+    assert found.height[0] == pytest.approx(1.25)
+    assert found.sigma[0] == pytest.approx(np.sqrt(0.25 * 0.75 + 1 / 12))
+    assert found.score[0] == pytest.approx(0.9)
+
+
+def test_no_corners_is_an_empty_table():
+    found = heads.dense_corners(np.zeros((8, 8)), np.zeros((2, 8, 8)), np.ones((3, 8, 8)) / 3, HEIGHTS, THRESHOLDS)
+    assert [len(c) for c in found] == [0] * 5
+
+
+def test_instances_paste_where_their_boxes_are():
+    """Full 28×28 masks fill their boxes; the better score wins an overlap; low scores are left out."""
+    outputs = {
+        "boxes": np.array([[4, 4, 20, 20], [14, 4, 30, 20], [40, 40, 60, 60]], np.float32),
+        "labels": np.ones(3, np.int64),
+        "scores": np.array([0.9, 0.8, 0.1], np.float32),
+        "masks": np.ones((3, 28, 28), np.float32),
+    }
+    found = heads.instance_sections(outputs, 64, {**THRESHOLDS, "min_area": 4})
+    assert found.labels.max() == 2
+    assert (found.labels[5:19, 5:19] == found.labels[10, 10]).all()
+    assert found.labels[10, 25] not in (0, found.labels[10, 10])
+    assert found.labels[50, 50] == 0
+    np.testing.assert_allclose(np.sort(found.scores), [0.8, 0.9])
+
+
+def test_instance_corners_decode_class_to_bin():
+    """Class 1 is the first bin (0-based labels would be 1 m off: PAPER, finding 8); two boxes on one corner are one."""
+    outputs = {
+        "boxes": np.array([[10, 10, 25, 25], [10, 10, 25, 25], [40, 40, 55, 55]], np.float32),
+        "labels": np.array([1, 2, 3]),
+        "scores": np.array([0.6, 0.6, 0.9], np.float32),
+    }
+    found = heads.instance_corners(outputs, HEIGHTS, THRESHOLDS)
+    assert sorted(zip(found.col.tolist(), found.height.round(6).tolist(), strict=True)) == [(17.5, 1.0), (47.5, 3.0)]

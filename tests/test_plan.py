@@ -1,0 +1,113 @@
+"""Plans: configuration to scenes, and signatures that change exactly where content changes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy
+import yaml
+
+from kibs_steps import fingerprint, plan
+from kibs_steps.plan import BadConfig
+
+SCHEMA = yaml.safe_load((Path(__file__).parents[1] / "workflow/schemas/config.schema.yaml").read_text())
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A raster and two model sets that differ in their corner model only."""
+    image = toy.paint([], 120, 100)
+    raster = toy.raster(tmp_path / "scene.tif", image)
+    toy.models(tmp_path / "a")
+    toy.models(tmp_path / "b")
+    toy.corners_model(tmp_path / "b" / "corners.onnx", bias=1.0)
+    return tmp_path, raster
+
+
+def make(files, **settings):
+    folder, raster = files
+    config = {"scene": "s", "raster": str(raster), "dtm": 0, "models": str(folder / "a"), "block": 2, **toy.VIEW, **settings}
+    ((name, full),) = plan.scenes(config, SCHEMA).items()
+    return plan.plan(name, full, folder, folder / "results")
+
+
+def changed(files, **settings):
+    """Which steps get another signature than the plain plan's."""
+    one, other = make(files).signature, make(files, **settings).signature
+    return {step for step in one if one[step] != other[step]}
+
+
+AFTER_DETECTION = {"stitch", "planes", "buildings", "solids", "evaluate", "run"}
+
+
+def test_blocks_cover_the_raster(files):
+    found = make(files)
+    assert [b.name for b in found.blocks] == ["r000c000", "r000c001", "r001c000", "r001c001"]
+    assert found.tiling == (toy.TILE, toy.MARGIN, 2)
+
+
+def test_another_corner_model_leaves_sections_alone(files):
+    assert changed(files, models=str(files[0] / "b")) - {"model_sections"} == {"model_corners", "blend", "corners", *AFTER_DETECTION}
+
+
+def test_another_view_leaves_detection_alone(files):
+    """The toy models take no geometry, so angles matter from the plane fit on (and for the truth's frames)."""
+    found = changed(files, view_azimuth=90.0)
+    assert {"scene", "planes"} <= found
+    assert not {"source", "tiles", "sections", "corners", "stitch"} & found
+
+
+def test_planes_rule_and_block(files):
+    assert changed(files, planes="paper") == {"planes", "buildings", "solids", "evaluate", "run"}
+    assert "scene" not in changed(files, block=3)
+
+
+def test_touching_a_file_changes_nothing_and_content_does(files):
+    folder, raster = files
+    before = make(files).signature
+    raster.touch()
+    assert make(files).signature == before
+    image = toy.paint(toy.houses(np.random.default_rng(0), 120, 100), 120, 100)
+    toy.raster(raster, image)
+    assert make(files).signature["tiles"] != before["tiles"]
+    assert (folder / "results" / ".fingerprints.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"raster": None}, "None is not of type 'string'|raster"),
+        ({"planes": "clever"}, "planes"),
+        ({"rastr": "x.tif"}, "rastr"),
+        ({"view_elevation": 120}, "view_elevation"),
+        ({"feed": "truth"}, "feed=truth needs truth"),
+        ({"scene": "a;rm -rf"}, "scene name"),
+        ({"models": "nowhere"}, "no model at"),
+        ({"block": 0}, "block"),
+    ],
+)
+def test_bad_configuration(files, settings, message):
+    from kibs_steps.errors import KibsError
+
+    with pytest.raises(KibsError, match=message):
+        make(files, **settings)
+
+
+def test_simulated_scene_needs_angles(files):
+    config = {"scenes": {"d": {"simulate": {"seed": 1, "size": 200}, "models": str(files[0] / "a")}}}
+    ((name, full),) = plan.scenes(config, SCHEMA).items()
+    with pytest.raises(BadConfig, match="view_azimuth"):
+        plan.plan(name, full, files[0], files[0] / "results")
+
+
+def test_no_scene_at_all():
+    with pytest.raises(BadConfig, match="no scene"):
+        plan.scenes({"scenes": {}}, SCHEMA)
+
+
+def test_fingerprint_survives_a_damaged_cache(tmp_path):
+    file, cache = tmp_path / "f", tmp_path / "cache.json"
+    file.write_bytes(b"abc")
+    first = fingerprint.of_file(file, cache)
+    cache.write_text("{")
+    assert fingerprint.of_file(file, cache) == first
