@@ -107,6 +107,18 @@ def _spans(
     return owner[::2][keep], row[::2][keep], col[::2][keep], col[1::2][keep]
 
 
+def pixel_counts(faces: Sequence[Polygon], k: tuple[float, float], frame: Grid, base: float = 0.0) -> np.ndarray:
+    """Pixel centres that each face would cover if nothing stood before it: (n,), also those outside the frame."""
+    if not len(faces):
+        return np.zeros(0, np.int64)
+    start, end, owner = _edges(faces)
+    seen_start, seen_end = (frame.to_image(p[:, :2] - (p[:, 2:] - base) * np.asarray(k, float)) for p in (start, end))
+    low = np.floor(np.minimum(seen_start.min(0), seen_end.min(0)))
+    width, height = (np.ceil(np.maximum(seen_start.max(0), seen_end.max(0)) - low) + 1).astype(int).tolist()
+    face, _, first, past = _spans(seen_start - low, seen_end - low, owner, width, height)
+    return np.bincount(face, past - first, minlength=len(faces)).astype(np.int64)
+
+
 def render_faces(faces: Sequence[Polygon], k: tuple[float, float], frame: Grid, base: float = 0.0) -> Hits:
     """Render planar faces as seen with lean `k` (m/m) on the reference plane at height `base` (m).
 

@@ -67,6 +67,7 @@ def envelope(wing: Wing) -> list[tuple[Slope, Ring2]]:
         for j, (p, q, r) in enumerate(wing.planes):
             if j != i and ring:
                 ring = clip(ring, p - a, q - b, r - c)
+        ring = _simple(ring)
         if len(ring) > 2 and area(ring) > TINY:
             cells.append(((a, b, c), ring))
     return cells
@@ -77,16 +78,19 @@ def _lift(slope: Slope, points: Ring2) -> np.ndarray:
     return np.column_stack([ring, ring @ slope[:2] + slope[2]])
 
 
-def _simple(polygon: Polygon) -> Ring2:
-    """The exterior, counter-clockwise, not closed, without points on straight lines."""
-    points = list(polygon.exterior.coords)[:-1]
-    if not polygon.exterior.is_ccw:
-        points.reverse()
-    kept = []
+def _simple(points: Ring2) -> Ring2:
+    """A counter-clockwise ring without repeated points (1 µm) and points on straight lines."""
+    apart = []
     for i, (x, y) in enumerate(points):
-        (px, py), (nx, ny) = points[i - 1], points[(i + 1) % len(points)]
+        if abs(x - points[i - 1][0]) + abs(y - points[i - 1][1]) > 1e-6:
+            apart.append((x, y))
+    if area(apart) < 0:
+        apart.reverse()
+    kept = []
+    for i, (x, y) in enumerate(apart):
+        (px, py), (nx, ny) = apart[i - 1], apart[(i + 1) % len(apart)]
         cross = (x - px) * (ny - y) - (y - py) * (nx - x)
-        if abs(cross) > 1e-6 * (abs(nx - px) + abs(ny - py) + 1e-3):
+        if abs(cross) > 1e-6 * (abs(nx - px) + abs(ny - py)):
             kept.append((x, y))
     return kept
 
@@ -132,7 +136,7 @@ def sections(wings: list[Wing]) -> list[np.ndarray]:
         whole = shapes[0] if len(shapes) == 1 else unary_union(shapes)
         for part in getattr(whole, "geoms", [whole]):
             if part.geom_type == "Polygon" and part.area > TINY:
-                ring = _simple(part)
+                ring = _simple(list(part.exterior.coords)[:-1])
                 if len(ring) > 2:
                     found.append(_lift(slope, ring))
     return found
@@ -195,21 +199,6 @@ def wing(
     if kind == "mansard":
         return Wing(footprint, (south, north, west, east, (0.0, 0.0, eave + pitch * half * share)))
     return Wing(footprint, (south, north, west, east))
-
-
-def split_at(rings: list[np.ndarray], a: float, b: float, c: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Cut convex sections by a vertical plane: the parts where a x + b y + c ≥ 0, and the others."""
-
-    def part(ring: np.ndarray, sign: float) -> np.ndarray | None:
-        flat = clip([(x, y) for x, y, _ in ring.tolist()], sign * a, sign * b, sign * c)
-        if len(flat) < 3 or area(flat) < TINY:
-            return None
-        (x0, y0, z0), normal = ring[0], np.cross(ring[1] - ring[0], ring[2] - ring[0])
-        slope = -normal[:2] / normal[2]
-        return np.array([(x, y, z0 + (x - x0) * slope[0] + (y - y0) * slope[1]) for x, y in flat])
-
-    sides = [[p for p in (part(r, s) for r in rings) if p is not None] for s in (1.0, -1.0)]
-    return sides[0], sides[1]
 
 
 def walls(rings: list[np.ndarray], overhang: float = 0.0) -> list[np.ndarray]:

@@ -270,7 +270,7 @@ def _photograph(
 
 
 def _truth(city: City, terrain: Terrain, grid: Grid, k: tuple[float, float], seen: np.ndarray) -> list[SectionTruth]:
-    counts = np.bincount(seen[1:-1, 1:-1].ravel()) if seen.size else np.zeros(1)
+    counts = np.bincount(seen.ravel())
     roofs = [f for f in city.faces if f.kind == ROOF]
     if not roofs:
         return []
@@ -278,24 +278,20 @@ def _truth(city: City, terrain: Terrain, grid: Grid, k: tuple[float, float], see
     points = np.concatenate(rings)
     above = points[:, 2] - terrain(points[:, :2])
     at = grid.to_image(geometry.image_position(points[:, :2], points[:, 2], k, terrain))
+    base = float(terrain.heights.flat[0]) if np.ptp(terrain.heights) == 0 else float(np.mean(terrain.heights))
+    whole = zbuffer.pixel_counts(roofs, k, _sample_frame(grid), base)
     shown = np.split(np.column_stack([at, above]), np.cumsum([len(r) for r in rings])[:-1])
     out, i = [], 0
-    for face in roofs:
+    for face, size in zip(roofs, whole, strict=True):
         outline, holes = shown[i], tuple(shown[i + 1 : i + 1 + len(face.holes)])
         i += 1 + len(face.holes)
         low, high = outline[:, :2].min(0), outline[:, :2].max(0)
         if (high < 0).any() or low[0] > grid.width or low[1] > grid.height:
             continue
-        size = abs(_area(outline)) - sum(abs(_area(h)) for h in holes)
         count = counts[face.section] if face.section < len(counts) else 0
-        visible = float(np.clip(count / 4 / max(size, 1e-6), 0, 1))
+        visible = float(np.clip(count / max(size, 1), 0, 1))
         out.append(SectionTruth(face.section, face.building, outline, face.ring, holes, face.holes, visible))
     return out
-
-
-def _area(ring: np.ndarray) -> float:
-    x, y = ring[:, 0], ring[:, 1]
-    return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
 
 
 def _corners(sections: list[SectionTruth], labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
