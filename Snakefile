@@ -7,11 +7,14 @@ from snakemake.exceptions import WorkflowError
 from kibs_steps import plan as plans
 from kibs_steps.errors import KibsError
 
+if Path("config.yaml").is_file():
 
-configfile: "config.yaml"
+    configfile: "config.yaml"
 
 
 RESULTS = Path("results")
+RUN = f"{workflow.basedir}/envs/run.yaml"
+LEARN = f"{workflow.basedir}/envs/learn.yaml"
 
 try:
     schema = yaml.safe_load(

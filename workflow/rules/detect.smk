@@ -14,6 +14,8 @@ rule sections:
         seams="results/{scene}/blocks/{block}/detected/seams.npz",
     log:
         "results/{scene}/logs/sections/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("sections"),
         block=lambda w: plan(w).tiling.block,
@@ -34,6 +36,8 @@ rule blend:
         temp("results/{scene}/blocks/{block}/blended.tif"),
     log:
         "results/{scene}/logs/blend/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("blend"),
         block=lambda w: plan(w).tiling.block,
@@ -52,6 +56,8 @@ rule corners:
         "results/{scene}/blocks/{block}/detected/corners.parquet",
     log:
         "results/{scene}/logs/corners/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("corners"),
         block=lambda w: plan(w).tiling.block,
@@ -69,6 +75,8 @@ rule truth:
         "results/{scene}/truth.parquet",
     log:
         "results/{scene}/logs/truth.log",
+    conda:
+        RUN
     params:
         signature=signature("truth"),
         frame=lambda w: plan(w).settings["truth_frame"],
@@ -90,6 +98,8 @@ rule feed:
         corners="results/{scene}/blocks/{block}/fed/corners.parquet",
     log:
         "results/{scene}/logs/feed/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("feed"),
         tiling=lambda w: plan(w).tiling,
@@ -124,6 +134,8 @@ rule stitch:
         corners="results/{scene}/stitched/corners.parquet",
     log:
         "results/{scene}/logs/stitch.log",
+    conda:
+        RUN
     params:
         signature=signature("stitch"),
         tiling=lambda w: plan(w).tiling,

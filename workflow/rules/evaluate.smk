@@ -14,6 +14,8 @@ rule evaluation:
         picture="results/{scene}/evaluation.png",
     log:
         "results/{scene}/logs/evaluation.log",
+    conda:
+        RUN
     params:
         signature=signature("evaluate"),
         fallback=lambda w: plan(w).models["corners"].contract["heights"]["fallback"],

@@ -29,6 +29,8 @@ rule geopackage:
         "results/{scene}/city.gpkg",
     log:
         "results/{scene}/logs/geopackage.log",
+    conda:
+        RUN
     params:
         signature=signature("solids"),
         tiling=lambda w: plan(w).tiling,
@@ -48,6 +50,8 @@ rule cityjson:
         sequence="results/{scene}/city.city.jsonl",
     log:
         "results/{scene}/logs/cityjson.log",
+    conda:
+        RUN
     params:
         signature=signature("solids"),
     shell:
@@ -63,6 +67,8 @@ rule points:
         "results/{scene}/points.txt",
     log:
         "results/{scene}/logs/points.log",
+    conda:
+        RUN
     params:
         signature=signature("buildings"),
     shell:
@@ -80,6 +86,8 @@ rule rasters:
         heights="results/{scene}/heights.tif",
     log:
         "results/{scene}/logs/rasters.log",
+    conda:
+        RUN
     params:
         signature=signature("buildings"),
         tiling=lambda w: plan(w).tiling,
@@ -99,6 +107,8 @@ rule preview:
         "results/{scene}/preview.png",
     log:
         "results/{scene}/logs/preview.log",
+    conda:
+        RUN
     params:
         signature=signature("buildings"),
     shell:

@@ -14,6 +14,8 @@ rule planes:
         filed="results/{scene}/blocks/{block}/filed_corners.parquet",
     log:
         "results/{scene}/logs/planes/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("planes"),
         reach=lambda w: plan(w).reach,
@@ -34,6 +36,8 @@ rule ground:
         "results/{scene}/blocks/{block}/ground.parquet",
     log:
         "results/{scene}/logs/ground/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("planes"),
     shell:
@@ -54,6 +58,8 @@ rule buildings:
         "results/{scene}/buildings.parquet",
     log:
         "results/{scene}/logs/buildings.log",
+    conda:
+        RUN
     params:
         signature=signature("buildings"),
         tiling=lambda w: plan(w).tiling,
@@ -75,6 +81,8 @@ rule solids:
         attributes="results/{scene}/blocks/{block}/solids.parquet",
     log:
         "results/{scene}/logs/solids/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("solids"),
         options=options("lod_label"),

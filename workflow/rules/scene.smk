@@ -9,6 +9,8 @@ rule simulated:
         truth="results/{scene}/simulated/truth.gpkg",
     log:
         "results/{scene}/logs/simulated.log",
+    conda:
+        RUN
     params:
         signature=signature("source"),
         options=options(
@@ -33,6 +35,8 @@ rule scene:
         dtm="results/{scene}/dtm.tif",
     log:
         "results/{scene}/logs/scene.log",
+    conda:
+        RUN
     params:
         signature=signature("scene"),
         gsd=lambda w: plan(w).models["sections"].contract["gsd"],
@@ -61,6 +65,8 @@ rule tiles:
         "results/{scene}/blocks/{block}/tiles.tif",
     log:
         "results/{scene}/logs/tiles/{block}.log",
+    conda:
+        RUN
     params:
         signature=signature("tiles"),
         tiling=lambda w: plan(w).tiling,
@@ -78,6 +84,8 @@ rule model:
         "results/{scene}/models/{task}.json",
     log:
         "results/{scene}/logs/model_{task}.log",
+    conda:
+        RUN
     params:
         signature=signature("model_{task}"),
         allow=lambda w: ["--allow-angles"] if plan(w).settings["allow_angles"] else [],
