@@ -1,0 +1,549 @@
+"""The roof partition of one building: sections that share their edges exactly, vertex for vertex.
+
+In: one polygon per section (map frame, metres from the building's own origin) and the section's plane. Sections come from
+independent fits and a shift along the view ray by their own height, so neighbours overlap or gape by up to a metre.
+Out: a list of `Face`, polygons of integer millimetres that tile the building without gap, overlap or sliver: wherever two
+faces meet, both have the same vertices.
+
+Sections that already fit (to `EXACT`) keep every vertex. Otherwise vertices that neighbours mean to share are brought together,
+what is claimed twice goes to the higher roof (the lower one runs under it) or, at one height, to the smaller section, and what
+nobody claims between sections goes to the neighbour with the longest edge on it, the lower one at a step: that roof is what the
+higher one hid. Then edges shorter than the noise are contracted.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+from math import atan2, hypot, pi
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+
+from kibs_steps.errors import KibsError
+
+MM = 1000
+EXACT = 0.005  # m, sections that fit better than this are left alone
+STEP = 0.6  # m, roofs this far apart in height are taken for two levels
+SMALLEST = 0.5  # m², faces smaller than this are given to a neighbour
+CLEARANCE = 0.02  # m, a vertex this near to an edge is made part of it
+STRAIGHT = 0.002  # m, a vertex this near to the line between its neighbours says nothing
+
+Point = tuple[int, int]
+Ring = list[Point]
+
+
+class Face(NamedTuple):
+    """A connected part of one section: its index, and rings of mm points, the exterior counter-clockwise first."""
+
+    section: int
+    rings: list[Ring]
+
+
+class NoPartition(KibsError):
+    """Sections that cannot be made into a partition."""
+
+
+def partition(
+    polygons: Sequence[shapely.Geometry],
+    planes: np.ndarray,
+    reliable: np.ndarray,
+    tolerance: float = 1.0,
+    noise: float = 0.35,
+) -> list[Face]:
+    """The faces of a building.
+
+    `polygons`: n polygons (m, any validity); `planes`: (n, 3) coefficients of z = a·x + b·y + c in the same frame;
+    `reliable`: (n,) bool, whose height can be trusted; `tolerance` (m): widest gap or overlap between neighbours;
+    `noise` (m): shortest edge worth keeping where sections do not fit. Raises `NoPartition`.
+    """
+    cleaned = [polygonal(p) for p in polygons]
+    if all(p.is_empty for p in cleaned):
+        raise NoPartition("no section has an area")
+    for reach in (EXACT, tolerance):
+        faces, fits = _tile(cleaned, planes, reliable, reach, 1.5 * tolerance)
+        if not faces:
+            raise NoPartition("no section is wide enough to stand")
+        if fits:
+            return straightened(_clear(_contracted(faces, 2 * EXACT)), STRAIGHT)
+    return _clear(_regular(faces, noise))
+
+
+def polygonal(geometry: shapely.Geometry | None) -> shapely.Geometry:
+    """The valid polygonal part of a geometry, in plan, on the millimetre grid; possibly empty."""
+    if geometry is None:
+        return shapely.Polygon()
+    flat = shapely.force_2d(geometry)
+    if not np.isfinite(shapely.get_coordinates(flat)).all():
+        return shapely.Polygon()
+    if not flat.is_valid:
+        flat = shapely.make_valid(flat, method="structure", keep_collapsed=False)
+    parts = [p for p in shapely.get_parts(flat) if p.geom_type == "Polygon" and not p.is_empty]
+    return shapely.set_precision(shapely.union_all(parts), 1 / MM) if parts else shapely.Polygon()
+
+
+def polygon(face: Face) -> shapely.Polygon:
+    """A face as a polygon of metres."""
+    exterior, *holes = [np.asarray(ring, float) / MM for ring in face.rings]
+    return shapely.Polygon(exterior, holes)
+
+
+def directed_edges(faces: Iterable[Face]) -> dict[tuple[Point, Point], int]:
+    """Which face lies on the left of each directed edge. Raises `NoPartition` where two do."""
+    edges: dict[tuple[Point, Point], int] = {}
+    for f, face in enumerate(faces):
+        for ring in face.rings:
+            for edge in zip(ring, [*ring[1:], ring[0]], strict=True):
+                if edge in edges:
+                    raise NoPartition(f"two sections claim the same side of the edge {edge}")
+                edges[edge] = f
+    return edges
+
+
+def rings_along(edges: Iterable[tuple[Point, Point]]) -> list[Ring]:
+    """Chain directed edges (area on their left) into rings; where a region touches itself, rings keep to their own corner."""
+    leaving: dict[Point, list[Point]] = defaultdict(list)
+    for u, v in sorted(edges):
+        leaving[u].append(v)
+    rings = []
+    for start in sorted(leaving):
+        while leaving[start]:
+            first = leaving[start].pop(0)
+            ring, before, at = [start], start, first
+            while True:
+                choices = [*leaving[at], first] if at == start else leaving[at]
+                if not choices:
+                    raise NoPartition(f"an outline ends at {at}")
+                following = min(choices, key=lambda p, at=at, before=before: _clockwise(at, before, p))
+                if at == start and following == first:
+                    break
+                ring.append(at)
+                leaving[at].remove(following)
+                before, at = at, following
+            rings.append(ring)
+    return rings
+
+
+def _clockwise(at: Point, reference: Point, other: Point) -> float:
+    """Angle (0, 2π] turned clockwise at `at` from the direction of `reference` to that of `other`."""
+    first = atan2(reference[1] - at[1], reference[0] - at[0])
+    second = atan2(other[1] - at[1], other[0] - at[0])
+    return (first - second) % (2 * pi) or 2 * pi
+
+
+def area(ring: Ring) -> float:
+    """Signed area (mm²), positive counter-clockwise."""
+    return sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(ring, [*ring[1:], ring[0]], strict=True)) / 2
+
+
+def regions(rings: list[Ring]) -> list[list[Ring]]:
+    """Group rings into exteriors, each followed by the holes inside it."""
+    exteriors = [r for r in rings if area(r) > 0]
+    grouped = [[r] for r in exteriors]
+    if len(exteriors) == 1:
+        grouped[0] += [r for r in rings if area(r) < 0]
+        return grouped
+    solid = [shapely.Polygon(r) for r in exteriors]
+    for hole in (r for r in rings if area(r) < 0):
+        inside = shapely.Polygon(hole).representative_point()
+        around = [k for k, p in enumerate(solid) if p.contains(inside)]
+        if around:
+            grouped[min(around, key=lambda k: solid[k].area)].append(hole)
+    return grouped
+
+
+def merged(faces: list[Face], label: Callable[[int], int | None]) -> list[Face]:
+    """Faces joined across edges where their `label` is the same; those labelled None are dropped."""
+    edges = directed_edges(faces)
+    labels = [label(f) for f in range(len(faces))]
+    neighbours: dict[int, set[int]] = defaultdict(set)
+    for (u, v), f in edges.items():
+        g = edges.get((v, u))
+        if g is not None and labels[g] == labels[f]:
+            neighbours[f].add(g)
+    outlines: dict[int, list[tuple[Point, Point]]] = defaultdict(list)
+    group = _components(len(faces), neighbours)
+    for (u, v), f in edges.items():
+        g = edges.get((v, u))
+        if g is None or group[g] != group[f]:
+            outlines[group[f]].append((u, v))
+    joined = []
+    for f in sorted(outlines):
+        if labels[f] is not None:
+            joined += [Face(labels[f], region) for region in regions(rings_along(outlines[f]))]
+    return joined
+
+
+def dissolved(faces: list[Face]) -> list[Face]:
+    """The whole building as one face per connected part, all of section 0."""
+    return straightened(merged(faces, lambda f: 0), STRAIGHT)
+
+
+def _components(n: int, neighbours: dict[int, set[int]]) -> list[int]:
+    """For each of n nodes the smallest node it is connected to."""
+    component = [-1] * n
+    for start in range(n):
+        waiting = [start] if component[start] < 0 else []
+        while waiting:
+            node = waiting.pop()
+            if component[node] < 0:
+                component[node] = start
+                waiting += neighbours.get(node, ())
+    return component
+
+
+def _tile(
+    polygons: list[shapely.Geometry], planes: np.ndarray, reliable: np.ndarray, reach: float, tolerance: float
+) -> tuple[list[Face], bool]:
+    """Faces from sections whose vertices are brought together within `reach`; whether no misfit below `tolerance` was left."""
+    together = [polygonal(p) for p in _snapped(polygons, planes, reliable, reach)]
+    slits = _slits(together, tolerance)
+    lines = shapely.unary_union(shapely.boundary([*together, *slits]), grid_size=1 / MM)
+    cells = shapely.get_parts(shapely.polygonize(shapely.get_parts(lines)))
+    if not len(cells):
+        return [], True
+    cells = shapely.orient_polygons(shapely.normalize(cells))
+    cells = cells[np.lexsort(shapely.bounds(cells).T)]
+    inner = shapely.point_on_surface(cells)
+    xy = shapely.get_coordinates(inner)
+    claims: list[list[int]] = [[] for _ in cells]
+    for k, section in zip(*shapely.STRtree(np.array(together, object)).query(inner, predicate="within"), strict=True):
+        claims[k].append(int(section))
+    in_slit = np.zeros(len(cells), bool)
+    if len(slits):
+        in_slit[shapely.STRtree(slits).query(inner, predicate="within")[0]] = True
+    narrow = shapely.is_empty(shapely.buffer(cells, -tolerance / 2, quad_segs=1)) & (shapely.area(cells) > 1e-12)
+    size = shapely.area(together)
+
+    def heights(k: int) -> dict[int, float]:
+        return {s: float(planes[s] @ (*xy[k], 1.0)) for s in claims[k]}
+
+    labels: list[int | None] = []
+    for k, claim in enumerate(claims):
+        if len(claim) > 1:
+            trusted = [s for s in claim if reliable[s]] or claim
+            z = heights(k)
+            top = max(z[s] for s in trusted)
+            labels.append(min((s for s in trusted if z[s] > top - STEP), key=lambda s: (size[s], s)))
+        else:
+            labels.append(claim[0] if claim else None)
+    misfit = (np.array([len(c) for c in claims]) != 1) & (narrow | in_slit)
+    visible = misfit & ~shapely.is_empty(shapely.buffer(cells, -EXACT, quad_segs=1))
+    faces = [Face(k, _rings_of(cell)) for k, cell in enumerate(cells)]
+    gaps = {k for k in np.flatnonzero(misfit) if labels[k] is None}
+    labels = _give_away(faces, labels, gaps, lambda k, s: float(planes[s] @ (*xy[k], 1.0)))
+    faces = merged(faces, lambda f: labels[f])
+    return _without_slivers(faces, 2 * EXACT if reach == EXACT else 0.3), not visible.any()
+
+
+def _rings_of(cell: shapely.Polygon) -> list[Ring]:
+    """A polygon's rings as mm points."""
+    return [
+        [(int(x), int(y)) for x, y in np.rint(shapely.get_coordinates(ring)[:-1] * MM)]
+        for ring in (cell.exterior, *cell.interiors)
+    ]
+
+
+def _slits(polygons: list[shapely.Geometry], width: float) -> np.ndarray:
+    """Strips narrower than `width` between different sections that are open to the outside at an end."""
+    roof = shapely.union_all(polygons)
+    closed = shapely.buffer(shapely.buffer(roof, width / 2, join_style="mitre"), -width / 2, join_style="mitre")
+    strips = shapely.get_parts(shapely.set_precision(shapely.difference(closed, roof), 1 / MM))
+    strips = strips[(shapely.get_type_id(strips) == 3) & (shapely.area(strips) > 0.02)]
+    if not len(strips):
+        return strips
+    near = shapely.STRtree(np.array(polygons, object)).query(strips, predicate="dwithin", distance=1.5 / MM)[0]
+    return strips[np.bincount(near, minlength=len(strips)) > 1]
+
+
+def _give_away(
+    faces: list[Face], labels: list[int | None], gaps: set[int], height: Callable[[int, int], float]
+) -> list[int | None]:
+    """Label each gap as the labelled neighbour with the longest edge on it; at a step between long ones, the lowest."""
+    edges = directed_edges(faces)
+    labels = list(labels)
+    waiting = sorted(gaps)
+    while waiting:
+        left = []
+        for k in waiting:
+            shared = _shared_lengths(faces[k], labels, edges)
+            if not shared:
+                left.append(k)
+                continue
+            longest = max(shared.values())
+            likely = [s for s, length in shared.items() if length > longest / 2]
+            lowest = min(height(k, s) for s in likely)
+            labels[k] = max((s for s in likely if height(k, s) < lowest + STEP), key=lambda s: (shared[s], -s))
+        if len(left) == len(waiting):
+            break
+        waiting = left
+    return labels
+
+
+def _shared_lengths(
+    face: Face, labels: Sequence[int | None], edges: dict[tuple[Point, Point], int]
+) -> dict[int, float]:
+    """Length (mm) of a face's edge with each label round it."""
+    shared: dict[int, float] = defaultdict(float)
+    for ring in face.rings:
+        for u, v in zip(ring, [*ring[1:], ring[0]], strict=True):
+            other = edges.get((v, u))
+            if other is not None and labels[other] is not None:
+                shared[labels[other]] += hypot(v[0] - u[0], v[1] - u[1])
+    return shared
+
+
+def _without_slivers(faces: list[Face], width: float) -> list[Face]:
+    """Give faces too small or narrower than `width` (m) to the neighbour with the longest shared edge; drop lonely ones."""
+    while True:
+        shapes = [polygon(f) for f in faces]
+        thin = shapely.is_empty(shapely.buffer(shapes, -width / 2, quad_segs=1))
+        small = [k for k in range(len(faces)) if thin[k] or (shapes[k].area < SMALLEST and width > 2 * EXACT)]
+        if not small:
+            return faces
+        k = min(small, key=lambda k: (shapes[k].area, k))
+        shared = _shared_lengths(faces[k], range(len(faces)), directed_edges(faces))
+        shared.pop(k, None)
+        target = max(shared, key=lambda g: (shared[g], -g)) if shared else None
+        sections = [f.section for f in faces]
+        joined = merged(faces, lambda f, k=k, target=target: target if f == k else f)
+        faces = [Face(sections[f.section], f.rings) for f in joined]
+        if not faces:
+            return faces
+
+
+class _Clusters:
+    """Vertices brought together: each cluster holds at most one vertex of a section and stays within a diameter."""
+
+    def __init__(self, xy: np.ndarray, section: np.ndarray, diameter: float) -> None:
+        self.xy, self.section, self.diameter = xy, section, diameter
+        self.of = list(range(len(xy)))
+        self.members = {k: [k] for k in range(len(xy))}
+
+    def join(self, a: int, b: int) -> None:
+        """Join the clusters of two vertices if the rules allow it."""
+        a, b = sorted((self.of[a], self.of[b]))
+        if a == b:
+            return
+        both = self.members[a] + self.members[b]
+        if len({int(self.section[k]) for k in both}) < len(both) or np.ptp(self.xy[both], axis=0).max() > self.diameter:
+            return
+        self.members[a] = both
+        for k in self.members.pop(b):
+            self.of[k] = a
+
+
+def _snapped(
+    polygons: list[shapely.Geometry], planes: np.ndarray, reliable: np.ndarray, reach: float
+) -> list[shapely.Geometry]:
+    """Sections with the vertices and edges they share brought together within `reach` (m)."""
+    parts, part_section = shapely.get_parts(np.array(polygons, object), return_index=True)
+    rings, ring_part = shapely.get_rings(parts, return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    last = np.r_[np.diff(ring) != 0, True]
+    xy, ring = xy[~last], ring[~last]
+    section = part_section[ring_part[ring]]
+    clusters = _Clusters(xy, section, reach)
+    pairs = cKDTree(xy).query_pairs(reach, output_type="ndarray")
+    pairs = pairs[section[pairs[:, 0]] != section[pairs[:, 1]]]
+    length = np.hypot(*(xy[pairs[:, 0]] - xy[pairs[:, 1]]).T)
+    for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0], length.round(6)))]:
+        clusters.join(a, b)
+
+    z = (planes[section] * np.c_[xy, np.ones(len(xy))]).sum(axis=1)
+    names = sorted(clusters.members)
+    moved = xy.copy()
+    centres = np.empty((len(names), 2))
+    for n, name in enumerate(names):
+        members = np.array(clusters.members[name])
+        trusted = members[reliable[section[members]]]
+        trusted = trusted if len(trusted) else members
+        high = trusted[z[trusted] > z[trusted].max() - STEP]
+        centres[n] = moved[members] = xy[high].mean(axis=0)
+    inserted = _meeting_points(
+        polygons, moved, ring, section, centres, [set(section[clusters.members[n]]) for n in names], reach
+    )
+
+    new = []
+    for r in range(len(rings)):
+        path = []
+        for k in np.flatnonzero(ring == r):
+            path += [moved[k], *inserted.get(int(k), ())]
+        path = [p for k, p in enumerate(path) if np.any(p != path[k - 1])]
+        new.append(path)
+    sections: list[list[shapely.Polygon]] = [[] for _ in polygons]
+    for p in range(len(parts)):
+        exterior, *holes = [new[r] for r in np.flatnonzero(ring_part == p)]
+        if len(exterior) >= 3:
+            sections[part_section[p]].append(shapely.Polygon(exterior, [h for h in holes if len(h) >= 3]))
+    return [shapely.MultiPolygon(s) if s else shapely.Polygon() for s in sections]
+
+
+def _meeting_points(
+    polygons: list[shapely.Geometry],
+    xy: np.ndarray,
+    ring: np.ndarray,
+    section: np.ndarray,
+    centres: np.ndarray,
+    sections_at: list[set[int]],
+    reach: float,
+) -> dict[int, list[np.ndarray]]:
+    """Vertices of neighbours that an edge should pass through: edge (by its first vertex) → points in order along it.
+
+    A vertex is taken only if the way from it to the edge runs through a gap (no section) or an overlap (both sections):
+    otherwise it is the far side of something narrow.
+    """
+    after = np.arange(len(xy)) + 1
+    firsts = np.flatnonzero(np.r_[True, np.diff(ring) != 0])
+    after[np.r_[firsts[1:], len(xy)] - 1] = firsts
+    edges = shapely.linestrings(np.stack([xy, xy[after]], axis=1))
+    e, c = shapely.STRtree(shapely.points(centres)).query(edges, predicate="dwithin", distance=reach)
+    keep = np.array([section[i] not in sections_at[j] for i, j in zip(e, c, strict=True)], bool)
+    e, c = e[keep], c[keep]
+    if not len(e):
+        return {}
+    along = xy[after[e]] - xy[e]
+    length = np.hypot(*along.T)
+    t = ((centres[c] - xy[e]) * along).sum(axis=1) / np.maximum(length, 1e-9) ** 2
+    foot = xy[e] + t[:, None] * along
+    keep = (t * length > 1 / MM) & ((1 - t) * length > 1 / MM)
+    if reach > EXACT:
+        middle = (foot + centres[c]) / 2
+        inside = shapely.contains_xy(np.array(polygons, object)[None, :], middle[:, :1], middle[:, 1:])
+        own = inside[np.arange(len(e)), section[e]]
+        theirs = np.array([inside[k, sorted(sections_at[j])].any() for k, j in enumerate(c)], bool)
+        keep &= (own == theirs) & (own | ~inside.any(axis=1))
+    points: dict[int, list[tuple[float, int]]] = defaultdict(list)
+    for i, j, at in zip(e[keep], c[keep], t[keep], strict=True):
+        points[int(i)].append((float(at), int(j)))
+    return {i: [centres[j] for _, j in sorted(found)] for i, found in points.items()}
+
+
+def _clear(faces: list[Face]) -> list[Face]:
+    """Faces whose edges pass through every vertex nearer than `CLEARANCE`, so that nothing almost touches."""
+    edges = sorted({(min(e), max(e)) for e in directed_edges(faces)})
+    points = sorted({p for e in edges for p in e})
+    lines = shapely.linestrings(np.array(edges, float))
+    e, p = shapely.STRtree(shapely.points(np.array(points, float))).query(lines, "dwithin", CLEARANCE * MM)
+    through: dict[tuple[Point, Point], list[Point]] = defaultdict(list)
+    for i, k in zip(e, p, strict=True):
+        if points[k] not in edges[i]:
+            through[edges[i]].append(points[k])
+    if not through:
+        return faces
+
+    def path(u: Point, v: Point) -> list[Point]:
+        between = through.get((min(u, v), max(u, v)), [])
+        return [u, *sorted(between, key=lambda q: hypot(q[0] - u[0], q[1] - u[1]))]
+
+    denser = []
+    for face in faces:
+        own = {
+            e for r in face.rings for u, v in zip(r, [*r[1:], r[0]], strict=True) for e in pairwise([*path(u, v), v])
+        }
+        open_edges = [(u, v) for u, v in own if (v, u) not in own]  # spikes and slits of the face have closed
+        denser += [Face(face.section, region) for region in regions(rings_along(open_edges))]
+    try:
+        directed_edges(denser)
+    except NoPartition:
+        return faces
+    return denser
+
+
+def straightened(faces: list[Face], tolerance: float) -> list[Face]:
+    """Faces without the vertices that lie within `tolerance` (m) of the line between their only two neighbours."""
+    while True:
+        around: dict[Point, set[Point]] = defaultdict(set)
+        fewest: dict[Point, int] = {}
+        for face in faces:
+            for ring in face.rings:
+                for before, point, after in zip([ring[-1], *ring[:-1]], ring, [*ring[1:], ring[0]], strict=True):
+                    around[point] |= {before, after}
+                    fewest[point] = min(fewest.get(point, len(ring)), len(ring))
+        dropped: set[Point] = set()
+        for point in sorted(around):
+            if len(around[point]) == 2 and fewest[point] > 3 and not around[point] & dropped:
+                a, b = around[point]
+                if _off_line(point, a, b) <= tolerance * MM:
+                    dropped.add(point)
+        slimmer = [Face(f.section, [[p for p in r if p not in dropped] for r in f.rings]) for f in faces]
+        if not dropped or any(len(r) < 3 for f in slimmer for r in f.rings):
+            return faces
+        faces = slimmer
+
+
+def _off_line(point: Point, a: Point, b: Point) -> float:
+    """Distance of `point` from the segment a–b; infinite beyond its ends."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    length = hypot(dx, dy)
+    px, py = point[0] - a[0], point[1] - a[1]
+    return abs(dx * py - dy * px) / length if length and 0 < dx * px + dy * py < length**2 else float("inf")
+
+
+def _regular(faces: list[Face], noise: float) -> list[Face]:
+    """Faces simplified on their shared edges to `noise` (m), none of the steps leaving a valid coverage."""
+    shapes = [polygon(f) for f in faces]
+    if not shapely.coverage_is_valid(shapes) or not shapely.is_valid(shapes).all():
+        return straightened(faces, STRAIGHT)
+    simple = shapely.orient_polygons(shapely.coverage_simplify(np.array(shapes, object), noise))
+    simpler = [Face(f.section, _rings_of(p)) for f, p in zip(faces, simple, strict=True) if not p.is_empty]
+    if _is_coverage(simpler):
+        faces = simpler
+    contracted = straightened(_contracted(faces, noise), noise / 5)
+    return contracted if _is_coverage(contracted) else straightened(faces, STRAIGHT)
+
+
+def _is_coverage(faces: list[Face]) -> bool:
+    """Whether faces are valid polygons that tile without overlap."""
+    if any(len(set(r)) < len(r) or len(r) < 3 for f in faces for r in f.rings):
+        return False
+    shapes = [polygon(f) for f in faces]
+    return bool(shapely.is_valid(shapes).all() and shapely.coverage_is_valid(shapes))
+
+
+def _contracted(faces: list[Face], shortest: float) -> list[Face]:
+    """Faces whose edges below `shortest` (m) are drawn together to their middle, shortest first, while all stay simple."""
+    refused: set[tuple[Point, Point]] = set()
+    while True:
+        at: dict[Point, set[int]] = defaultdict(set)
+        edges = set()
+        for f, face in enumerate(faces):
+            for ring in face.rings:
+                for u, v in zip(ring, [*ring[1:], ring[0]], strict=True):
+                    at[u].add(f)
+                    edges.add((min(u, v), max(u, v)))
+        short = [(hypot(v[0] - u[0], v[1] - u[1]), u, v) for u, v in edges - refused]
+        short = sorted(s for s in short if s[0] < shortest * MM)
+        if not short:
+            return faces
+        _, u, v = short[0]
+        middle = ((u[0] + v[0]) // 2, (u[1] + v[1]) // 2)
+        touched = sorted(at[u] | at[v])
+        drawn = [_drawn_together(faces[f], u, v, middle) for f in touched]
+        if (middle in at and middle not in (u, v)) or not _all_simple(drawn):
+            refused.add((u, v))
+            continue
+        faces = list(faces)
+        for f, face in zip(touched, drawn, strict=True):
+            faces[f] = face
+
+
+def _drawn_together(face: Face, u: Point, v: Point, middle: Point) -> Face:
+    """The face with two of its points made one."""
+    rings = []
+    for ring in face.rings:
+        new = [middle if p in (u, v) else p for p in ring]
+        rings.append([p for k, p in enumerate(new) if p != new[k - 1]])
+    return Face(face.section, rings)
+
+
+def _all_simple(faces: list[Face]) -> bool:
+    """Whether each face is a valid polygon, counter-clockwise, of more than `SMALLEST` / 2."""
+    if any(len(r) < 3 or len(set(r)) < len(r) for f in faces for r in f.rings):
+        return False
+    if any(area(f.rings[0]) < SMALLEST / 2 * MM**2 for f in faces):
+        return False
+    return bool(shapely.is_valid([polygon(f) for f in faces]).all())
