@@ -1,0 +1,207 @@
+"""Real Snakemake runs on the toy world: reruns follow content, kills are survived, cores and blocks do not matter."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyogrio
+import pytest
+import toy
+
+ROOT = Path(__file__).parents[2]
+PUBLISHED = [
+    "city.gpkg",
+    "city.city.json",
+    "city.city.jsonl",
+    "points.txt",
+    "heights.tif",
+    "labels.tif",
+    "preview.png",
+    "run.json",
+]
+SAME_BYTES = [f for f in PUBLISHED if f != "run.json"]
+SIZE = (150, 110)
+
+
+def command(folder: Path, cores: int = 2, **settings: object) -> list[str]:
+    """The user's command, run from a folder of their own."""
+    base = {"scene": "town", "raster": "town.tif", "dtm": 100, "models": "models", "block": 2, **toy.VIEW, **settings}
+    config = [f"{k}={v}" for k, v in base.items()]
+    return [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", str(cores), "--config", *config]
+
+
+def run(folder: Path, *flags: str, cores: int = 2, **settings: object) -> str:
+    """Run the workflow to its end and return what it printed."""
+    done = subprocess.run([*command(folder, cores, **settings), *flags], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-5000:]
+    return done.stdout + done.stderr
+
+
+def jobs(output: str) -> dict[str, int]:
+    """How many jobs of each rule an output tells of."""
+    found: dict[str, int] = {}
+    for rule in re.findall(r"^(?:localrule|rule) (\w+):", output, re.M):
+        found[rule] = found.get(rule, 0) + 1
+    return found
+
+
+def digests(folder: Path, scene: str = "town") -> dict[str, str]:
+    """sha256 of every published file that must not vary."""
+    return {f: hashlib.sha256((folder / "results" / scene / f).read_bytes()).hexdigest() for f in SAME_BYTES}
+
+
+def world(folder: Path) -> Path:
+    """A folder with a painted raster and toy models."""
+    folder.mkdir(parents=True, exist_ok=True)
+    toy.raster(folder / "town.tif", toy.paint(toy.houses(np.random.default_rng(5), *SIZE), *SIZE))
+    toy.models(folder / "models")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def town(tmp_path_factory) -> Path:
+    """A finished run that tests copy or look at, never change."""
+    folder = world(tmp_path_factory.mktemp("town"))
+    run(folder)
+    return folder
+
+
+@pytest.fixture
+def copy(town, tmp_path) -> Path:
+    """A finished run to play with (dates kept)."""
+    folder = tmp_path / "copy"
+    shutil.copytree(town, folder, copy_function=shutil.copy2)
+    return folder
+
+
+def test_all_published_files_are_there(town):
+    for name in PUBLISHED:
+        assert (town / "results/town" / name).stat().st_size > 0
+    assert not list(town.rglob(".tmp-*"))
+    layers = {name for name, _ in pyogrio.list_layers(town / "results/town/city.gpkg")}
+    assert {"buildings", "footprints", "roof_sections", "roof_sections_image", "corners", "blocks"} <= layers
+
+
+def test_points_txt(town):
+    """One `x y z id` per section corner, in map metres, id 2 without a split."""
+    lines = (town / "results/town/points.txt").read_text().splitlines()
+    rows = np.array([line.split() for line in lines], float)
+    assert rows.shape[1] == 4
+    assert set(rows[:, 3]) == {2}
+    assert (np.abs(rows[:, 0] - toy.X0 - 30) < 60).all()
+    assert (rows[:, 2] > 100).all()
+
+
+def test_nothing_to_do_is_quick_and_touching_is_nothing(copy):
+    (copy / "town.tif").touch()
+    (copy / "models/corners.onnx").touch()
+    start = time.monotonic()
+    output = run(copy)
+    assert jobs(output) == {}
+    print(f"a run with nothing to do took {time.monotonic() - start:.1f} s")
+
+
+def test_another_corner_model_reruns_corners_only(copy):
+    before = digests(copy)
+    toy.corners_model(copy / "models/corners.onnx", bias=1.0)
+    done = jobs(run(copy))
+    assert not {"scene", "tiles", "sections"} & set(done)
+    assert {"blend", "corners", "stitch", "planes", "solids"} <= set(done)
+    assert digests(copy)["points.txt"] != before["points.txt"]
+
+
+def test_another_view_reruns_from_the_planes(copy):
+    done = jobs(run(copy, view_azimuth=95))
+    assert {"scene", "planes", "ground"} <= set(done)
+    assert not {"tiles", "sections", "blend", "corners", "stitch"} & set(done)
+
+
+def test_deleted_block_is_redone_alone(copy):
+    before = digests(copy)
+    shutil.rmtree(copy / "results/town/blocks/r000c001")
+    done = jobs(run(copy))
+    assert all(n == 1 for n in done.values())
+    assert {"tiles", "sections", "corners", "planes", "ground", "solids"} <= set(done)
+    assert "stitch" not in done
+    assert digests(copy) == before
+
+
+def test_deleted_result_is_made_again(copy):
+    before = digests(copy)
+    (copy / "results/town/city.gpkg").unlink()
+    assert set(jobs(run(copy))) == {"geopackage"}
+    assert digests(copy) == before
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_cores_do_not_matter(town, tmp_path, cores):
+    folder = world(tmp_path / "again")
+    run(folder, cores=cores)
+    assert digests(folder) == digests(town)
+
+
+@pytest.mark.parametrize("block", [1, 4])
+def test_block_size_gives_the_same_sections(town, tmp_path, block):
+    """All layers but `blocks` are alike, whatever the size of jobs."""
+    folder = world(tmp_path / "other")
+    run(folder, block=block)
+    for layer in ("roof_sections", "roof_sections_image", "buildings", "footprints", "corners"):
+        frames = []
+        for f in (folder, town):
+            frame = pyogrio.read_dataframe(f / "results/town/city.gpkg", layer=layer)
+            frames.append(sorted(zip(*(map(str, frame[c]) for c in sorted(frame.columns)), strict=True)))
+        assert frames[0] == frames[1], layer
+    for name in ("points.txt", "heights.tif", "labels.tif"):
+        assert digests(folder)[name] == digests(town)[name]
+
+
+def test_killed_run_goes_on_to_the_same_bytes(town, tmp_path):
+    """SIGKILL to snakemake and its jobs in the middle; the same command with --nolock finishes alike."""
+    folder = world(tmp_path / "killed")
+    process = subprocess.Popen(
+        command(folder), cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    deadline = time.monotonic() + 120
+    while not list(folder.glob("results/town/blocks/*/detected/pieces.parquet")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (folder / "results/town/city.gpkg").exists()
+    run(folder, "--nolock")
+    assert digests(folder) == digests(town)
+
+
+def test_bad_input_is_told_in_words(tmp_path):
+    folder = world(tmp_path / "bad")
+    done = subprocess.run(command(folder, raster="nowhere.tif"), cwd=folder, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "nowhere.tif" in done.stderr
+    done = subprocess.run(command(folder, planes="clever"), cwd=folder, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "planes" in done.stderr
+
+
+def test_names_with_spaces_and_accents(tmp_path):
+    """Files may be called what their owners like; nothing is built from names by a shell."""
+    folder = world(tmp_path / "été à la mer")
+    shutil.move(folder / "town.tif", folder / "l'image; touch x.tif")
+    run(folder, raster="l'image; touch x.tif")
+    assert (folder / "results/town/city.gpkg").is_file()
+    assert not (folder / "x.tif").exists()
+
+
+def test_run_json_tells_models_and_counts(town):
+    record = json.loads((town / "results/town/run.json").read_text())
+    text = json.dumps(record)
+    assert "CC0-1.0" in text
+    assert hashlib.sha256((town / "models/sections.onnx").read_bytes()).hexdigest() in text
