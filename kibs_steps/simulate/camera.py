@@ -32,7 +32,7 @@ class Camera(NamedTuple):
 
 def camera(rng: np.random.Generator) -> Camera:
     """A camera and its processing, drawn at random."""
-    blue = rng.gamma(1.2, 0.12)
+    blue = 0.04 + rng.gamma(1.2, 0.13)
     return Camera(
         blur=rng.uniform(0.4, 1.3) if rng.random() < 0.85 else rng.uniform(1.3, 1.8),
         haze=(0.35 * blue, 0.6 * blue, blue),
@@ -45,7 +45,7 @@ def camera(rng: np.random.Generator) -> Camera:
         bright=float(rng.choice([0.0005, rng.uniform(0.001, 0.03)])),
         top=rng.uniform(0.6, 1.02),
         balance=tuple(np.exp(rng.normal(0, 0.06, 3))),
-        saturation=rng.uniform(0.45, 1.35),
+        saturation=rng.uniform(0.4, 1.2),
         jpeg=int(rng.integers(55, 97)) if rng.random() < 0.5 else 0,
     )
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from kibs_steps import zbuffer
-from kibs_steps.simulate.city import TREE, WALL, Face, Paint
+from kibs_steps.simulate.site import TREE, WALL, Face, Paint
 from kibs_steps.simulate.surfaces import Material
 
 SIDE = 512  # samples of the noise, 0.25 m each
@@ -50,7 +50,7 @@ def noise() -> tuple[np.ndarray, np.ndarray]:
     f = np.hypot(fx, fy)
     f[0, 0] = 1.0
     fields = []
-    for spectrum in (f**-1.1 * (f > 1.5 / SIDE), np.exp(-(((f - 0.16) / 0.10) ** 2))):
+    for spectrum in (f**-1.1 * (f > 1.5 / SIDE), f**-0.6 * (f > 0.02) * (f < 0.45)):
         white = np.fft.rfft2(rng.normal(size=(SIDE, SIDE)))
         field = np.fft.irfft2(white * spectrum, (SIDE, SIDE))
         fields.append((field / field.std()).astype(np.float32))

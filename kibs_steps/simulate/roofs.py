@@ -264,7 +264,7 @@ class Frame(NamedTuple):
     def holds(self, u0: float, v0: float, u1: float, v1: float) -> bool:
         """Whether a rectangle lies in the (convex) section."""
         ring = self.ring
-        edge = np.roll(ring, -1, axis=0) - ring
+        edge = np.concatenate([ring[1:], ring[:1]]) - ring
         corners = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]])
         d = corners[:, None] - ring[None]
         return bool((edge[None, :, 0] * d[..., 1] - edge[None, :, 1] * d[..., 0] >= -1e-6).all())
@@ -272,16 +272,17 @@ class Frame(NamedTuple):
 
 def frame_of(ring: np.ndarray) -> Frame:
     """Axes of a section; of a flat one, along its longest edge."""
-    normal = np.zeros(3)
-    local = ring - ring[0]
-    for i in range(1, len(ring) - 1):
-        normal += np.cross(local[i], local[i + 1])
-    gradient = -normal[:2] / normal[2]
+    x, y, z = (ring - ring[0]).T
+    after = np.arange(1, len(ring) + 1)
+    after[-1] = 0
+    x1, y1, z1 = x[after], y[after], z[after]
+    up = float((x * y1 - y * x1).sum())
+    gradient = np.array([-(y * z1 - z * y1).sum() / up, -(z * x1 - x * z1).sum() / up])
     rise = float(np.hypot(*gradient))
     if rise > 1e-3:
         up = gradient / rise
     else:
-        edges = np.roll(ring, -1, axis=0)[:, :2] - ring[:, :2]
+        edges = ring[after, :2] - ring[:, :2]
         longest = edges[np.argmax((edges**2).sum(1))]
         up, rise = np.array([-longest[1], longest[0]]) / np.hypot(*longest), 0.0
     along = np.array([up[1], -up[0]])

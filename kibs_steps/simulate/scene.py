@@ -23,7 +23,8 @@ from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction, convergence
 from kibs_steps.simulate import camera, light
-from kibs_steps.simulate.city import CLUTTER, ROOF, STYLES, City, procedural
+from kibs_steps.simulate.city import STYLES, procedural
+from kibs_steps.simulate.site import CLUTTER, ROOF, City
 from kibs_steps.terrain import Terrain, flat
 
 STRIP = 256  # rows shaded at a time
@@ -145,10 +146,10 @@ def _lit(city: City, seen: _Seen, samples: Grid, sun: tuple[float, float], facin
 def _paint(city: City, samples: Grid) -> np.ndarray:
     """Index of the paint on the ground at each sample."""
     canvas = np.zeros((samples.height, samples.width), np.int32)
-    low, high = np.array(samples.bounds[:2]) - 5, np.array(samples.bounds[2:]) + 5
-    for i, paint in enumerate(city.paints):
-        if (paint.ring.max(0) < low).any() or (paint.ring.min(0) > high).any():
-            continue
+    low, high = _extents([p.ring for p in city.paints])
+    meets = (high > np.array(samples.bounds[:2]) - 1).all(1) & (low < np.array(samples.bounds[2:]) + 1).all(1)
+    for i in np.flatnonzero(meets).tolist():
+        paint = city.paints[i]
         ring = np.round((samples.to_image(paint.ring) - 0.5) * 16).astype(np.int32)
         cv2.fillPoly(canvas, [ring], i, shift=4)
     return canvas
@@ -230,12 +231,18 @@ def _shine(
     return shine
 
 
+def _extents(rings: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates of rings (n, 2 or 3): (rings, 2 or 3) each."""
+    starts = np.cumsum([0] + [len(r) for r in rings[:-1]])
+    points = np.concatenate(rings)
+    return np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+
+
 def _near(city: City, terrain: Terrain, samples: Grid, view: tuple[float, float], sun: tuple[float, float]) -> City:
     """The city without faces that can neither be seen in the frame nor throw a shadow into it."""
     if not city.faces:
         return city
-    low = np.array([f.ring.min(0) for f in city.faces])
-    high = np.array([f.ring.max(0) for f in city.faces])
+    low, high = _extents([f.ring for f in city.faces])
     floor, roof = terrain.heights.min(), terrain.heights.max()
     top = np.maximum(high[:, 2] - floor, 0)
     reach = top * (np.hypot(*view) + np.hypot(*sun)) + (roof - floor) * np.hypot(*view) + 2
@@ -367,7 +374,7 @@ def random_scene(
     grid = Grid("", 0.0, side, gsd, size, size)
     view = _direction(rng.uniform(0, 360), min(rng.uniform(*view_elevation), 89.9))
     sun = _direction(rng.uniform(0, 360), rng.uniform(*sun_elevation))
-    style = style or str(rng.choice([*STYLES, "mixed"], p=[0.2, 0.15, 0.11, 0.12, 0.11, 0.1, 0.03, 0.05, 0.13]))
+    style = style or str(rng.choice([*STYLES, "mixed"], p=[0.2, 0.15, 0.11, 0.12, 0.09, 0.08, 0.02, 0.05, 0.05, 0.13]))
     margin = 25.0 + (15.0 if style in ("centre", "perimeter") else 0.0)
     terrain = flat(0.0)
     if rng.random() < 0.35:

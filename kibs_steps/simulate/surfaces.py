@@ -6,6 +6,7 @@ surface's own axes: u along the eave, v up the slope (walls: height). A **palett
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -30,15 +31,17 @@ class Material(NamedTuple):
 
 
 class Palette(NamedTuple):
-    """Materials of one scene and what they are used for: name of a use -> indices into `materials`, drawn with `weights`."""
+    """Materials of one scene and what they are used for: name of a use -> indices into `materials`, drawn by
+    cumulative `weights`."""
 
     materials: list[Material]
     uses: dict[str, list[int]]
-    weights: dict[str, np.ndarray]
+    weights: dict[str, list[float]]
 
     def draw(self, rng: np.random.Generator, use: str) -> int:
         """One material for a use."""
-        return int(rng.choice(self.uses[use], p=self.weights[use]))
+        place = bisect_right(self.weights[use], rng.random())
+        return self.uses[use][min(place, len(self.uses[use]) - 1)]
 
 
 PITCHED = {
@@ -230,12 +233,12 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
     age = rng.uniform(0.4, 1.3)
     materials: list[Material] = []
     uses: dict[str, list[int]] = {}
-    weights: dict[str, np.ndarray] = {}
+    weights: dict[str, list[float]] = {}
 
     def add(use: str, new: list[Material], share: list[float] | None = None) -> None:
         uses[use] = list(range(len(materials), len(materials) + len(new)))
         w = np.array(share or [1.0] * len(new), float)
-        weights[use] = w / w.sum()
+        weights[use] = (np.cumsum(w) / w.sum()).tolist()
         materials.extend(new)
 
     for use, (pitched, flat) in (("", COUNTRIES[country]), ("works_", COUNTRIES["works"])):
@@ -261,7 +264,7 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
         ],
     )
     dry = rng.beta(0.8, 1.6)
-    lush, sere = np.array((0.055, 0.105, 0.035)), np.array((0.24, 0.20, 0.12))
+    lush, sere = np.array((0.062, 0.098, 0.045)), np.array((0.24, 0.205, 0.135))
     green = lambda t: tuple((lush * (1 - t) + sere * t).tolist())  # noqa: E731
     add(
         "lawn",
@@ -278,7 +281,7 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
     add(
         "rough",
         [
-            Material(_jitter(rng, green(np.clip(dry + d, 0, 1)), 0.2), 0.35, 0.12, leaf=rng.uniform(0.3, 0.7))
+            Material(_jitter(rng, green(np.clip(dry + d, 0, 1)), 0.2), 0.35, 0.12, leaf=rng.uniform(0.15, 0.45))
             for d in (0.0, 0.3)
         ],
     )
@@ -345,7 +348,7 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
         leaves += [(0.20, 0.12, 0.04), (0.22, 0.07, 0.03), (0.13, 0.10, 0.07)]
     thick = rng.uniform(0.25, 0.8)
     add("tree", [Material(_jitter(rng, c, 0.2), 0.2, 0.15, leaf=thick) for c in leaves])
-    add("bare", [Material(_jitter(rng, (0.14, 0.115, 0.09), 0.15), 0.2, 0.3, leaf=0.8)])
+    add("bare", [Material(_jitter(rng, (0.085, 0.075, 0.06), 0.15), 0.2, 0.25, leaf=0.5)])
     cars = [
         (0.65, 0.65, 0.65),
         (0.4, 0.4, 0.41),

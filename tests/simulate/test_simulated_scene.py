@@ -8,7 +8,7 @@ from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
 from kibs_steps.simulate import scene
 from kibs_steps.simulate.camera import Camera
-from kibs_steps.simulate.city import OBJECT, ROOF, WALL, City, Face, Paint
+from kibs_steps.simulate.site import OBJECT, ROOF, WALL, City, Face, Paint
 from kibs_steps.simulate.roofs import prism
 from kibs_steps.simulate.surfaces import Material
 

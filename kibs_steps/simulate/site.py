@@ -1,0 +1,475 @@
+"""A city being built: its faces, ground paints and materials, and what may stand there.
+
+A **section** is one planar part of a roof, numbered from 1; what lies *on* a section (dormer, chimney, solar panel) names it in
+`on` and belongs to none. Streets form a grid (coordinates s, t in m) that is bent and turned as a whole, so plots stay simple
+while streets curve. A raster of occupied ground keeps buildings from standing in each other.
+
+In: a random generator, a terrain, a palette, an area in map metres. Out: lists of `Face` and `Paint`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+
+from kibs_steps.simulate import roofs
+from kibs_steps.simulate.roofs import Wing
+from kibs_steps.simulate.surfaces import Material, Palette
+from kibs_steps.terrain import Terrain
+
+ROOF, WALL, TREE, CAR, CLUTTER, OBJECT = range(6)  # kinds of faces; CLUTTER stands on a roof, OBJECT on the ground
+CELL = 0.5  # m: of the raster of occupied ground
+
+Option = TypeVar("Option")
+
+
+def pick(rng: np.random.Generator, options: Sequence[Option]) -> Option:
+    """One of several options, all equally likely."""
+    return options[int(rng.random() * len(options))]
+
+
+class Face(NamedTuple):
+    """A planar polygon: ring (n, 3) and holes, map metres, absolute z, counter-clockwise seen from outside."""
+
+    ring: np.ndarray
+    holes: tuple[np.ndarray, ...] = ()
+    kind: int = OBJECT
+    section: int = 0
+    building: int = 0
+    material: int = 0
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    on: int = 0
+
+
+class Paint(NamedTuple):
+    """A polygon (n, 2) map metres of one material on the ground; `angle` (rad) of its texture's u axis."""
+
+    ring: np.ndarray
+    material: int
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    angle: float = 0.0
+
+
+class City(NamedTuple):
+    """Faces, ground paints and the materials both index."""
+
+    faces: list[Face]
+    paints: list[Paint]
+    materials: list[Material]
+
+
+class Place(NamedTuple):
+    """Where a building's own frame stands: position (m), angle of its x axis (rad), base (m absolute)."""
+
+    x: float
+    y: float
+    angle: float
+    base: float = 0.0
+
+    def put(self, ring: np.ndarray) -> np.ndarray:
+        """A ring (n, 2 or 3) of the building's frame in map metres."""
+        c, s = math.cos(self.angle), math.sin(self.angle)
+        out = np.array(ring, float)
+        out[:, 0] = self.x + c * ring[:, 0] - s * ring[:, 1]
+        out[:, 1] = self.y + s * ring[:, 0] + c * ring[:, 1]
+        if out.shape[1] == 3:
+            out[:, 2] += self.base
+        return out
+
+
+class Site:
+    """A city being built: everything added goes through here, so that numbers and materials stay consistent."""
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        terrain: Terrain,
+        kit: Palette,
+        area: tuple[float, float, float, float],
+        bend: float,
+    ):
+        self.rng, self.terrain, self.kit, self.area = rng, terrain, kit, area
+        self.faces: list[Face] = []
+        self.paints: list[Paint] = []
+        self.sections = 0
+        self.buildings = 0
+        self.level = bool(np.ptp(terrain.heights) == 0)
+        self.ground = float(terrain.heights.flat[0])
+        self.turn = rng.uniform(0, 2 * np.pi)
+        self.middle = ((area[0] + area[2]) / 2, (area[1] + area[3]) / 2)
+        self.bend = tuple((bend * rng.uniform(4, 14, 2)).tolist())
+        self.wave = tuple((2 * np.pi / rng.uniform(120, 400, 2)).tolist())
+        self.phase = tuple(rng.uniform(0, 2 * np.pi, 2).tolist())
+        cells = (int((area[3] - area[1]) / CELL) + 120, int((area[2] - area[0]) / CELL) + 120)
+        self.taken = np.zeros(cells, np.uint8)
+        # The manners of a place.
+        self.furnished = rng.beta(1, 1.5)  # how much stands on roofs
+        self.solar = pick(rng, [0.0, rng.uniform(0, 0.25)])
+        self.leafy = pick(rng, [0.2, 0.7, 1.3, 2.2, 3.5])  # trees per 100 m² of garden
+        self.hedges = rng.random()
+        self.bare = pick(rng, [0.0, 0.0, 0.0, 0.0, 0.05, 0.6])  # share of trees without leaves
+        self.parked = 0.75 * rng.beta(0.8, 1.4)
+        self.road = kit.draw(rng, "asphalt" if rng.random() < 0.9 else "pavement")
+
+    def at(self, s: float, t: float) -> tuple[float, float]:
+        """Map metres of street coordinates."""
+        a = s + self.bend[0] * math.sin(t * self.wave[0] + self.phase[0])
+        b = t + self.bend[1] * math.sin(s * self.wave[1] + self.phase[1])
+        c, r = math.cos(self.turn), math.sin(self.turn)
+        return self.middle[0] + c * a - r * b, self.middle[1] + r * a + c * b
+
+    def place(self, s: float, t: float, angle: float = 0.0) -> Place:
+        """The frame of something at (s, t), turned by `angle` (rad) against the street."""
+        x, y = self.at(s, t)
+        ahead = self.at(s + 1.0, t)
+        return Place(x, y, math.atan2(ahead[1] - y, ahead[0] - x) + angle)
+
+    def inside(self, x: float, y: float, margin: float = 0.0) -> bool:
+        """Whether a map position is in the area grown by `margin`."""
+        a = self.area
+        return a[0] - margin < x < a[2] + margin and a[1] - margin < y < a[3] + margin
+
+    def grounded(self, place: Place, ring: np.ndarray) -> Place:
+        """The place with its base at the lowest terrain under a footprint (n, ≥ 2, own frame)."""
+        if self.level:
+            return place._replace(base=self.ground)
+        x_y = place.put(np.asarray(ring, float)[:, :2])
+        x_y = np.concatenate([x_y, (x_y + np.roll(x_y, -1, axis=0)) / 2, x_y.mean(0, keepdims=True)])
+        return place._replace(base=float(self.terrain(x_y).min()))
+
+    def tint(self, amount: float = 0.05) -> tuple[float, float, float]:
+        """A random brightness with a little colour."""
+        bright, r, g, b = self.rng.standard_normal(4).tolist()
+        return tuple(math.exp(amount * (bright + 0.3 * c)) for c in (r, g, b))
+
+    def paint(self, ring: np.ndarray, use: str | int, tint: float = 0.08, angle: float | None = None) -> None:
+        """Paint a polygon (n, 2 map metres)."""
+        material = self.kit.draw(self.rng, use) if isinstance(use, str) else use
+        self.paints.append(Paint(ring, material, self.tint(tint), self.turn if angle is None else angle))
+
+    def paint_street(self, s0: float, t0: float, s1: float, t1: float, use: str | int, tint: float = 0.08) -> None:
+        """Paint a rectangle in street coordinates, bent with the streets."""
+        half = math.hypot(s1 - s0, t1 - t0) / 2
+        if not self.inside(*self.at((s0 + s1) / 2, (t0 + t1) / 2), half):
+            return
+        n = int(2 * half / 12) + 1 if any(self.bend) else 1
+        shares = [i / n for i in range(n)]
+        ring = [(s0 + (s1 - s0) * i, t0) for i in shares] + [(s1, t0 + (t1 - t0) * i) for i in shares]
+        ring += [(s1 + (s0 - s1) * i, t1) for i in shares] + [(s0, t1 + (t0 - t1) * i) for i in shares]
+        self.paint(np.array([self.at(s, t) for s, t in ring]), use, tint)
+
+    def _cells(self, place: Place, ring: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray] | None:
+        """The part of the raster under a ring, and the ring's mask in it; None outside."""
+        x_y = (place.put(ring) - [self.area[0], self.area[1]]) / CELL + 60
+        col, row = np.maximum(x_y.min(0).astype(int), 0).tolist()
+        right, bottom = (x_y.max(0).astype(int) + 2).tolist()
+        window = (slice(row, bottom), slice(col, right))
+        shape = self.taken[window].shape
+        if not all(shape):
+            return None
+        points = np.round((x_y - [col, row] - 0.5) * 16).astype(np.int32)
+        return window, cv2.fillPoly(np.zeros(shape, np.uint8), [points], 1, shift=4)
+
+    def free(self, place: Place, rings: list[np.ndarray]) -> bool:
+        """Whether no building stands within rings (n, 2, own frame), a hand's breadth of touching apart."""
+        for ring in rings:
+            middle = ring.mean(0)
+            size = np.ptp(ring, axis=0)
+            found = self._cells(place, middle + (ring - middle) * np.maximum(1 - 1.4 / size, 0.2))
+            if found and (self.taken[found[0]] & found[1]).any():
+                return False
+        return True
+
+    def occupy(self, place: Place, rings: list[np.ndarray]) -> None:
+        """Mark the ground under rings (n, 2, own frame) as built on."""
+        for ring in rings:
+            found = self._cells(place, ring)
+            if found:
+                self.taken[found[0]] |= found[1]
+
+    def built(self, x: float, y: float) -> bool:
+        """Whether a building stands at a map position."""
+        row, col = int((y - self.area[1]) / CELL) + 60, int((x - self.area[0]) / CELL) + 60
+        return 0 <= row < self.taken.shape[0] and 0 <= col < self.taken.shape[1] and bool(self.taken[row, col])
+
+    # Buildings.
+
+    def building(
+        self,
+        place: Place,
+        wings: list[Wing],
+        roof: int | None = None,
+        wall: int | None = None,
+        overhang: float = 0.0,
+        parapet: float = 0.0,
+        use: str = "",
+        number: int | None = None,
+        furnish: bool = True,
+        tints: float = 0.05,
+    ) -> int:
+        """A building with its roof sections, walls and what stands on the roof. Returns its number; 0, and nothing is built,
+        outside the area or where another building stands."""
+        rng = self.rng
+        if not self.inside(place.x, place.y, 30.0):
+            return 0
+        footprints = [np.array(w.footprint) for w in wings]
+        if not self.free(place, footprints):
+            return 0
+        self.occupy(place, footprints)
+        rings = roofs.sections(wings)
+        place = self.grounded(place, np.concatenate(rings))
+        if number is None:
+            self.buildings += 1
+            number = self.buildings
+        flat = len(rings) == 1 and np.ptp(rings[0][:, 2]) < 1e-6
+        if roof is None:
+            roof = self.kit.draw(rng, use + ("flat" if flat and rng.random() < 0.9 else "pitched"))
+        wall = self.kit.draw(rng, use + "wall") if wall is None else wall
+        common = self.tint(tints)
+        paint = self.tint(0.08)
+        for ring in rings:
+            self.sections += 1
+            own = self.tint(0.03)
+            tint = (common[0] * own[0], common[1] * own[1], common[2] * own[2])
+            hole = self._penthouse(place, ring, roof, wall, number, self.sections) if parapet and furnish else ()
+            self.faces.append(
+                Face(place.put(ring), hole, ROOF, self.sections if not hole else self.sections - 1, number, roof, tint)
+            )
+            section = self.faces[-1].section
+            if parapet:
+                self._parapet(place, ring, parapet, section, number, wall, paint)
+            if furnish:
+                self._furnish(place, ring, section, number, roof, tint, wall, paint)
+        for quad in roofs.walls(rings, overhang):
+            self.faces.append(Face(place.put(quad), (), WALL, 0, number, wall, paint))
+        return number
+
+    def _penthouse(
+        self, place: Place, ring: np.ndarray, roof: int, wall: int, number: int, host: int
+    ) -> tuple[np.ndarray, ...]:
+        """Sometimes a storey set back on a flat roof: a section of its own, and a hole in the one below."""
+        rng = self.rng
+        axes = roofs.frame_of(ring)
+        size = axes.ring.max(0)
+        if axes.rise > 0.01 or len(ring) != 4 or size.min() < 9 or rng.random() > 0.3:
+            return ()
+        u0, v0 = size * rng.uniform(0.12, 0.4, 2)
+        u1, v1 = size - size * rng.uniform(0.12, 0.4, 2)
+        if not axes.holds(u0, v0, u1, v1) or (u1 - u0) * (v1 - v0) < 12:
+            return ()
+        foot = roofs.slab(axes, u0, v0, u1, v1, 0.0)
+        top, sides = roofs.prism(foot[:, :2], ring[0, 2], ring[0, 2] + rng.uniform(2.2, 3.6))
+        self.sections += 1
+        self.faces.append(Face(place.put(top), (), ROOF, self.sections, number, roof, self.tint(0.1)))
+        self.faces += [Face(place.put(side), (), WALL, 0, number, wall, self.tint(0.03)) for side in sides]
+        return (place.put(foot),)
+
+    def _on(
+        self, place: Place, rings: list[np.ndarray], section: int, number: int, material: int, tint: float = 0.06
+    ) -> None:
+        shade = self.tint(tint)
+        self.faces += [Face(place.put(ring), (), CLUTTER, 0, number, material, shade, section) for ring in rings]
+
+    def _parapet(
+        self,
+        place: Place,
+        ring: np.ndarray,
+        height: float,
+        section: int,
+        number: int,
+        wall: int,
+        tint: tuple[float, float, float],
+    ) -> None:
+        after = np.roll(ring, -1, axis=0)
+        edge = (after - ring)[:, :2]
+        inward = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
+        before = np.roll(inward, 1, axis=0)
+        shift = 0.28 * (inward + before) / np.maximum(1 + (inward * before).sum(1), 0.2)[:, None]
+        inner = ring.copy()
+        inner[:, :2] += shift
+        top, low_outer = ring + np.array([0, 0, height]), ring
+        top_inner = inner + np.array([0, 0, height])
+        cap = self.kit.draw(self.rng, "wall") if self.rng.random() < 0.4 else wall
+        for i in range(len(ring)):
+            j = (i + 1) % len(ring)
+            quads = [[top[i], top[j], top_inner[j], top_inner[i]], [low_outer[i], low_outer[j], top[j], top[i]]]
+            quads.append([inner[j], inner[i], top_inner[i], top_inner[j]])
+            self.faces += [Face(place.put(np.array(q)), (), CLUTTER, 0, number, cap, tint, section) for q in quads]
+
+    def _furnish(
+        self,
+        place: Place,
+        ring: np.ndarray,
+        section: int,
+        number: int,
+        roof: int,
+        tint: tuple[float, float, float],
+        wall: int,
+        paint: tuple[float, float, float],
+    ) -> None:
+        """Dormers, skylights, solar panels and chimneys on slopes; boxes, panels and lights on flat roofs."""
+        rng = self.rng
+        axes = roofs.frame_of(ring)
+        width, depth = axes.ring.max(0)
+        if width * depth < 14 or axes.rise > 1.6:
+            return
+        much = self.furnished
+        draw = self.kit.draw
+        if axes.rise > 0.12:
+            if rng.random() < self.solar and width > 3:
+                w, d = min(width * rng.uniform(0.3, 0.9), 12), depth * rng.uniform(0.35, 0.8)
+                u, v = rng.uniform(0, width - w), rng.uniform(0.2, 0.8) * (depth - d)
+                if axes.holds(u, v, u + w, v + d):
+                    self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.1)], section, number, draw(rng, "solar"))
+                    return
+            if axes.rise > 0.45 and width > 4 and rng.random() < 0.45 * much:
+                gable, w, h = rng.random() < 0.5, rng.uniform(1.2, 2.6), rng.uniform(0.9, 1.6)
+                count = int(rng.integers(1, max(2, int(width / 3.5))))
+                v = rng.uniform(0.1, 0.35) * depth
+                for i in range(count):
+                    made = roofs.dormer(axes, width * (i + 0.5) / count, v, w, h, gable)
+                    if made:
+                        self.faces += [Face(place.put(r), (), CLUTTER, 0, number, roof, tint, section) for r in made[0]]
+                        self.faces += [
+                            Face(place.put(r), (), CLUTTER, 0, number, wall, paint, section) for r in made[1]
+                        ]
+            elif rng.random() < 0.6 * much:
+                for _ in range(int(rng.integers(1, 4))):
+                    u, v, w = rng.uniform(0.1, 0.85) * width, rng.uniform(0.2, 0.7) * depth, rng.uniform(0.6, 1.2)
+                    if axes.holds(u, v, u + w, v + 1.3 * w):
+                        self._on(
+                            place,
+                            [roofs.slab(axes, u, v, u + w, v + 1.3 * w, 0.05)],
+                            section,
+                            number,
+                            draw(rng, "skylight"),
+                        )
+            if rng.random() < 0.5 * much + 0.1:
+                u, v, w = rng.uniform(0.1, 0.85) * width, rng.uniform(0.55, 0.9) * depth, rng.uniform(0.5, 1.0)
+                if axes.holds(u, v, u + w, v + 0.6):
+                    foot = roofs.slab(axes, u, v, u + w, v + 0.6, 0.0)
+                    top, sides = roofs.prism(
+                        foot[:, :2], float(foot[:, 2].min()), float(foot[:, 2].max()) + rng.uniform(0.4, 1.4)
+                    )
+                    self._on(place, [top, *sides], section, number, draw(rng, "chimney"))
+            return
+        count = rng.poisson(min(width * depth / 90, 14) * 1.2 * much)
+        for _ in range(count):
+            w, d = rng.uniform(0.7, 3.2, 2)
+            u, v = rng.uniform(0.5, max(width - w, 0.6)), rng.uniform(0.5, max(depth - d, 0.6))
+            if not axes.holds(u, v, u + w, v + d):
+                continue
+            foot = roofs.slab(axes, u, v, u + w, v + d, 0.0)
+            if rng.random() < 0.3:
+                self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.15)], section, number, draw(rng, "skylight"))
+            else:
+                top, sides = roofs.prism(
+                    foot[:, :2], float(foot[:, 2].min()) - 0.2, float(foot[:, 2].max()) + rng.uniform(0.4, 2.4)
+                )
+                self._on(place, [top, *sides], section, number, draw(rng, "metal"), 0.2)
+        if rng.random() < 0.6 * self.solar and axes.rise < 0.1:
+            gap = rng.uniform(1.6, 2.6)
+            for v in np.arange(1.0, depth - 1.5, gap)[:25]:
+                u0, u1 = width * 0.1, width * rng.uniform(0.7, 0.92)
+                if axes.holds(u0, v, u1, v + gap * 0.6):
+                    quad = roofs.slab(axes, u0, v, u1, v + gap * 0.6, 0.1)
+                    quad[2:, 2] += 0.35
+                    self._on(place, [quad], section, number, self.kit.uses["solar"][0])
+
+    # What stands on the ground.
+
+    def box(
+        self,
+        place: Place,
+        ring: np.ndarray,
+        height: float,
+        use: str,
+        kind: int = OBJECT,
+        low: float = 0.0,
+        tint: float = 0.1,
+    ) -> None:
+        """An upright prism on the ground that is no building."""
+        material = self.kit.draw(self.rng, use)
+        place = self.grounded(place, ring)
+        top, sides = roofs.prism(np.asarray(ring, float), low, height)
+        shade = self.tint(tint)
+        self.faces += [Face(place.put(r), (), kind, 0, 0, material, shade) for r in (top, *sides)]
+
+    def tank(self, place: Place, radius: float, height: float) -> None:
+        """A round tank or silo: looks like a roof, is none."""
+        angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+        self.box(place, radius * np.column_stack([np.cos(angle), np.sin(angle)]), height, "metal")
+
+    def car(self, x: float, y: float, angle: float) -> None:
+        """A car or van: body, cabin."""
+        rng = self.rng
+        if not self.inside(x, y, 4.0) or self.built(x, y):
+            return
+        material, glass = self.kit.draw(rng, "car"), self.kit.uses["glass"][0]
+        place = Place(x, y, angle)
+        van = rng.random() < 0.12
+        half, wide = (2.7, 1.0) if van else (rng.uniform(1.9, 2.4), rng.uniform(0.82, 0.95))
+        place = self.grounded(place, np.array([[0.0, 0.0]]))
+        body = np.array(roofs.rectangle(-half, -wide, half, wide), float)
+        top, sides = roofs.prism(body, 0.0, 2.1 if van else 0.85)
+        shade = self.tint(0.12)
+        self.faces += [Face(place.put(r), (), CAR, 0, 0, material, shade) for r in (top, *sides)]
+        if not van:
+            cabin = np.array(roofs.rectangle(-0.62 * half, -0.86 * wide, 0.35 * half, 0.86 * wide), float)
+            self.faces.append(Face(place.put(np.column_stack([cabin, np.full(4, 0.95)])), (), CAR, 0, 0, glass))
+            cap = np.array(roofs.rectangle(-0.42 * half, -0.78 * wide, 0.12 * half, 0.78 * wide), float)
+            self.faces.append(Face(place.put(np.column_stack([cap, np.full(4, 1.4)])), (), CAR, 0, 0, material, shade))
+
+    def tree(self, x: float, y: float, radius: float, height: float, use: str = "tree", conifer: bool = False) -> None:
+        """A crown of tilted leafy discs, clumpy and self-shadowing."""
+        rng = self.rng
+        if not self.inside(x, y, 10.0) or self.built(x, y):
+            return
+        z0 = self.ground if self.level else float(self.terrain(np.array([[x, y]]))[0])
+        material = self.kit.draw(rng, use)
+        if conifer:
+            share = np.array([0.0, 0.3, 0.58, 0.85])
+            centre = np.column_stack([np.zeros(4), np.zeros(4), height * (0.25 + 0.75 * share)])
+            size = radius * (1 - 0.85 * share)
+            normal = rng.normal(0, 0.15, (4, 3)) + np.array([0, 0, 1])
+        else:
+            n = int(np.clip(4 + radius * 2.2, 4, 14))
+            direction = rng.normal(size=(n, 3))
+            direction[:, 2] = np.abs(direction[:, 2]) - 0.2
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            direction[0] = (0, 0, -0.3)
+            deep = min(0.45 * height, radius)
+            centre = direction * [0.62 * radius, 0.62 * radius, 0.8 * deep] + [0, 0, height - deep]
+            size = radius * rng.uniform(0.38, 0.62, n)
+            size[0] = 0.85 * radius
+            normal = direction * [0.8, 0.8, 1.0] + [0, 0, 0.55]
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        x_n, y_n, z_n = normal.T
+        side = np.column_stack([z_n, 0 * z_n, -x_n]) / np.hypot(z_n, x_n)[:, None]
+        x_s, _, z_s = side.T
+        other = np.column_stack([y_n * z_s, z_n * x_s - x_n * z_s, -y_n * x_s])
+        angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+        reach = size[:, None] * rng.uniform(0.75, 1.15, (len(size), 8))
+        discs = centre[:, None] + reach[..., None] * (
+            np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * other[:, None]
+        )
+        discs += [x, y, z0]
+        bright = np.exp(rng.normal(0, 0.16, len(size))) * np.exp(rng.normal(0, 0.12))
+        self.faces += [
+            Face(d, (), TREE, 0, 0, material, (b, b, b)) for d, b in zip(discs, bright.tolist(), strict=True)
+        ]
+
+    def trees(self, s0: float, t0: float, s1: float, t1: float, density: float, tall: float = 9.0) -> None:
+        """Trees in a street rectangle: `density` per 100 m²; now and then clumped."""
+        rng = self.rng
+        n = rng.poisson(max(0.0, (s1 - s0) * (t1 - t0)) * density / 100)
+        at = np.column_stack([rng.uniform(s0, s1, n), rng.uniform(t0, t1, n)])
+        for (s, t), h in zip(at.tolist(), (tall * np.exp(rng.normal(0, 0.4, n))).tolist(), strict=True):
+            x, y = self.at(s, t)
+            conifer = rng.random() < 0.15
+            r = h * rng.uniform(0.13, 0.22) if conifer else h * rng.uniform(0.28, 0.5)
+            self.tree(x, y, min(r, 7.0), h, conifer=conifer, use="bare" if rng.random() < self.bare else "tree")
