@@ -82,6 +82,8 @@ def house(
     steep: tuple[float, float] = (18, 52),
 ) -> None:
     """A detached house."""
+    if not site.inside(place.x, place.y, length):
+        return
     rng = site.rng
     kind = pick(rng, kinds)
     plan = "rectangle" if rng.random() < plain else pick(rng, PLANS)

@@ -214,10 +214,9 @@ class Site:
         """A building with its roof sections, walls and what stands on the roof. Returns its number; 0, and nothing is built,
         outside the area or where another building stands."""
         rng = self.rng
-        if not self.inside(place.x, place.y, 30.0):
-            return 0
         footprints = [np.array(w.footprint) for w in wings]
-        if not self.free(place, footprints):
+        reach = max(float(np.abs(f).max()) for f in footprints)
+        if not self.inside(place.x, place.y, reach) or not self.free(place, footprints):
             return 0
         self.occupy(place, footprints)
         rings = roofs.sections(wings)
