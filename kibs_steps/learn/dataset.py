@@ -136,10 +136,13 @@ def empty(rgb: np.ndarray) -> Sample:
 def simulated(
     rng: np.random.Generator,
     size: int = 256,
-    backgrounds: Sequence[np.ndarray] | None = None,
+    backgrounds: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
     view_elevation: tuple[float, float] = (50.0, 90.0),
 ) -> Sample:
-    """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere."""
+    """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere.
+
+    `backgrounds` are photographs (rgb, usable as ground: bool) for the simulator's ground.
+    """
     from kibs_steps.simulate.scene import random_scene
 
     gsd = GSD * rng.uniform(0.9, 1.1)

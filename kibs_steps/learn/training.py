@@ -280,7 +280,7 @@ def fill_pool(pool: Path, count: int, seed: int, chips: list[dataset.Chip]) -> N
     """Render simulated tiles into a folder until it holds `count`, leaving what is there."""
     os.nice(5)
     cv2.setNumThreads(1)
-    backgrounds = [chip.rgb for chip in chips]
+    backgrounds = [(chip.rgb, ~chip.building) for chip in chips]
     pool.mkdir(parents=True, exist_ok=True)
     for number in range(count):
         path = pool / f"{seed}-{number:06d}.npz"
