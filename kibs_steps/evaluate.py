@@ -640,7 +640,7 @@ def draw(
     foot = page.height - 28
     picture.swatches(pen, (16, foot), [(colour, name) for name, colour in colours.items()])
     picture.colour_bar(pen, (330, foot), ("-3 m", "+3 m"), picture.DIFFERENCES)
-    picture.scale_bar(pen, (610, foot), picture.metre(scene.grid, scale), 160)
+    picture.scale_bar(pen, (610, foot), scale / scene.grid.gsd, 160)
     picture.write(path, page)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -17,9 +16,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from kibs_steps import imagery, store, tiles
 from kibs_steps.scene import Scene
-
-if TYPE_CHECKING:
-    from kibs_steps.grid import Grid
 
 FINER = 2  # how much larger than the result everything is drawn
 INK, PAPER, QUIET = (38, 42, 46), (250, 249, 246), (122, 128, 134)
@@ -94,7 +90,7 @@ def paint(
     for outline, colour in zip(outlines, colours.tolist(), strict=True):
         shell, *holes = rings(outline, scale * FINER)
         if holes:
-            _fill_around(fill, shell, holes, tuple(colour))
+            fill_around(fill, shell, holes, tuple(colour))
         else:
             draw.polygon(shell, fill=tuple(colour))
     picture = Image.blend(base, fill, cover)
@@ -105,7 +101,8 @@ def paint(
     return picture.resize((rgb.shape[1], rgb.shape[0]), Image.Resampling.BOX)
 
 
-def _fill_around(picture: Image.Image, shell: list, holes: list[list], colour: tuple[int, int, int]) -> None:
+def fill_around(picture: Image.Image, shell: list, holes: list[list], colour: tuple[int, int, int]) -> None:
+    """Fill a ring but for its holes."""
     points = np.array(shell)
     left, top = np.floor(points.min(axis=0)).astype(int)
     right, bottom = np.ceil(points.max(axis=0)).astype(int) + 1
@@ -187,8 +184,3 @@ def write(path: str | Path, picture: Image.Image) -> None:
     """Write a PNG, whole."""
     with store.whole(path) as temporary:
         picture.save(temporary, format="PNG", optimize=False, compress_level=6)
-
-
-def metre(grid: Grid, scale: float) -> float:
-    """Picture pixels per metre."""
-    return scale / grid.gsd

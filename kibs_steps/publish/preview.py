@@ -1,0 +1,157 @@
+"""Preview: `preview.png`, the result at a glance.
+
+Left, the raster with every roof section where it is *seen*, coloured by where it faces (hue) and how steep it is (strength).
+Right, the city where it *stands*: roofs over shaded terrain, coloured by height above ground and lit from the north-west,
+taller ones casting a longer shadow. Both panels show the same ground at the same scale.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+import pyarrow as pa
+import shapely
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFilter
+
+from kibs_steps import cli, picture, store
+from kibs_steps import scene as scenes
+from kibs_steps.picture import FINER
+from kibs_steps.scene import Scene
+
+LONGEST = 1200  # px: longer side of a panel
+LIGHT = np.array([-0.5, 0.5, 0.7])  # towards the lamp of the shaded map: north-west, as maps have it
+SHADOW = np.array([0.45, 0.45])  # m east and south per m of height
+
+
+def by_height(heights: NDArray[np.float64]) -> tuple[NDArray[np.uint8], float]:
+    """Colours of heights above ground (m), and the height at the ramp's end: a round number most roofs stay below."""
+    top = picture.nice_length(max(float(np.nanquantile(heights, 0.98)), 1.0)) if len(heights) else 10.0
+    top = next(
+        step
+        for step in (top, 1.5 * top, 2 * top, 2.5 * top)
+        if not len(heights) or step >= np.nanquantile(heights, 0.9)
+    )
+    return picture.ramp(heights, 0.0, top), top
+
+
+def shaded(colours: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours (n, 3) of planes with gradients a, b (m/m) in the lamp's light; a level plane keeps its own."""
+    normal = np.stack([-a, -b, np.ones_like(a)], axis=-1) / np.sqrt(1 + a**2 + b**2)[..., None]
+    light = LIGHT / np.linalg.norm(LIGHT)
+    strength = np.clip(normal @ light, 0, None) / light[2]
+    return np.clip(colours * (0.45 + 0.55 * strength)[..., None], 0, 255).astype(np.uint8)
+
+
+def terrain_shade(scene: Scene, size: tuple[int, int], scale: float) -> NDArray[np.uint8]:
+    """The terrain of the grid as a pale relief, (rows, cols, 3) of `size` (width, height) picture pixels."""
+    step = 4
+    cols, rows = np.meshgrid(np.arange(0, size[0] + step, step), np.arange(0, size[1] + step, step))
+    place = scene.grid.to_map(np.stack([cols, rows], axis=-1).reshape(-1, 2) / scale)
+    heights = scene.terrain(scene.grid.bounds)(place).reshape(cols.shape)
+    metres = step * scene.grid.gsd / scale
+    down, along = np.gradient(heights, metres)
+    base = np.full((*heights.shape, 3), (232, 231, 225), np.uint8)
+    relief = Image.fromarray(shaded(base, 2 * along, -2 * down))
+    return np.asarray(relief.resize(size, Image.Resampling.BICUBIC))
+
+
+def standing_panel(
+    scene: Scene, outlines: NDArray[np.object_], planes: NDArray[np.float64], heights: NDArray[np.float64], size: tuple[int, int],
+    scale: float,
+) -> tuple[Image.Image, float]:  # fmt: skip
+    """The map view: roofs (map frame) over relief; `planes` (n, 2) are gradients, `heights` (n,) m above ground."""
+    large = (size[0] * FINER, size[1] * FINER)
+    page = Image.fromarray(terrain_shade(scene, size, scale)).resize(large, Image.Resampling.BICUBIC)
+    colours, top = by_height(heights)
+    lit = shaded(colours, planes[:, 0], planes[:, 1]).tolist()
+    pixels = [
+        [scene.grid.to_image(shapely.get_coordinates(ring)) * scale * FINER for ring in shapely.get_rings(outline)]
+        for outline in outlines
+    ]
+    shadow = Image.new("L", large)
+    pen = ImageDraw.Draw(shadow)
+    for (shell, *_), height in zip(pixels, heights.tolist(), strict=True):
+        away = SHADOW * max(height, 0.0) / scene.grid.gsd * scale * FINER
+        pen.polygon([tuple(p) for p in shapely.get_coordinates(_swept(shell, away)).tolist()], fill=110)
+    shadow = shadow.filter(ImageFilter.GaussianBlur(1.2 * FINER))
+    page.paste((40, 44, 60), (0, 0), shadow)
+    pen = ImageDraw.Draw(page)
+    # From low to high, so that what stands above is drawn last.
+    for i in np.argsort(heights, kind="stable"):
+        shell, *holes = ([tuple(p) for p in ring.tolist()] for ring in pixels[i])
+        if holes:
+            picture.fill_around(page, shell, holes, tuple(lit[i]))
+            pen = ImageDraw.Draw(page)
+        else:
+            pen.polygon(shell, fill=tuple(lit[i]))
+        for ring in (shell, *holes):
+            pen.line(ring, fill=tuple(int(c * 0.55) for c in lit[i]), width=FINER)
+    return page.resize(size, Image.Resampling.BOX), top
+
+
+def _swept(ring: NDArray[np.float64], away: NDArray[np.float64]) -> shapely.Polygon:
+    """The area a ring covers on its way along a vector: its shadow on level ground, without the notches."""
+    return shapely.convex_hull(shapely.multipoints(np.vstack([ring, ring + away])))
+
+
+def compass(page: Image.Image, centre: tuple[int, int], radius: int) -> None:
+    """The key of directions: a disc with the colour of a roof of 35° facing each way, north up."""
+    side = 4 * radius
+    y, x = np.mgrid[:side, :side] - side / 2 + 0.5
+    azimuth = np.degrees(np.arctan2(x, -y)) % 360
+    distance = np.hypot(x, y) / (side / 2)
+    colours = picture.directions((40 * distance).ravel(), azimuth.ravel()).reshape(side, side, 3)
+    disc = Image.fromarray(colours).resize((2 * radius, 2 * radius), Image.Resampling.BOX)
+    mask = Image.fromarray(np.where(distance <= 1, 255, 0).astype(np.uint8)).resize(disc.size, Image.Resampling.BOX)
+    page.paste(disc, (centre[0] - radius, centre[1] - radius), mask)
+    pen = ImageDraw.Draw(page)
+    for name, (dx, dy) in {"N": (0, -1), "E": (1, 0), "S": (0, 1), "W": (-1, 0)}.items():
+        place = (centre[0] + dx * (radius + 8), centre[1] + dy * (radius + 8))
+        pen.text(place, name, font=picture.font(11), fill=picture.QUIET, anchor="mm")
+
+
+def preview(scene: Scene, sections: pa.Table) -> Image.Image:
+    """The whole picture of a scene's sections (`buildings.parquet`)."""
+    rgb, scale = picture.overview(scene, LONGEST)
+    seen = shapely.from_wkb(sections["outline"].to_numpy())
+    standing = shapely.from_wkb(sections["outline_map"].to_numpy())
+    value = {
+        name: sections[name].to_numpy().astype(float)
+        for name in ("slope", "azimuth", "plane_a", "plane_b", "height_mean")
+    }
+    facing = picture.directions(value["slope"], value["azimuth"])
+    typical = np.sqrt(np.median(shapely.area(seen))) * scale if len(seen) else 10.0
+    width = float(np.clip(typical / 18, 0.5, 1.6))  # thin lines over many small roofs
+    left = picture.paint(rgb, seen, facing, scale, cover=0.42, width=width)
+    gradients = np.column_stack([value["plane_a"], value["plane_b"]])
+    right, top = standing_panel(scene, standing, gradients, value["height_mean"], left.size, scale)
+
+    buildings = len(np.unique(sections["building_id"].to_numpy())) if "building_id" in sections.column_names else 0
+    note = f"{len(seen):,} roof sections" + (f", {buildings:,} buildings" if buildings else "")
+    titles = ["as seen from the satellite", "where they stand"]
+    page = picture.sheet([left, right], titles, scene.name, note, foot=76)
+    pen = ImageDraw.Draw(page)
+    foot = page.height - 38
+    picture.scale_bar(pen, (16, foot + 6), scale / scene.grid.gsd, 180)
+    compass(page, (300, foot), 21)
+    pen.text((340, foot), "facing; paler is flatter", font=picture.font(15), fill=picture.INK, anchor="lm")
+    picture.colour_bar(pen, (560, foot), ("0", f"{top:g} m above ground"), picture.HEIGHTS)
+    return page
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Draw the preview of a scene."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.preview", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
+    parser.add_argument("--out", required=True, help="out: preview.png")
+    args = parser.parse_args(argv)
+    tables = [store.read_table(path) for path in args.sections]
+    sections = pa.concat_tables(tables, promote_options="permissive").sort_by("section_id")
+    picture.write(args.out, preview(scenes.read(args.scene), sections))
+
+
+if __name__ == "__main__":
+    cli.run(main)
