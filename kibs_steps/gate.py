@@ -144,7 +144,7 @@ def _manifold(faces: Sequence[Rings]) -> list[Problem]:
     for point, fan in corners.items():
         if _steps_round(dict(fan), fan[0][0]) < len(fan):
             problems.append(Problem("vertex", (), f"separate fans of faces meet in vertex {point}"))
-    return problems or _one_piece(corners)
+    return problems or _one_piece(faces)
 
 
 def _steps_round(following: dict[Point3, Point3], start: Point3) -> int:
@@ -155,15 +155,20 @@ def _steps_round(following: dict[Point3, Point3], start: Point3) -> int:
     return steps
 
 
-def _one_piece(corners: dict[Point3, list[tuple[Point3, Point3]]]) -> list[Problem]:
-    """All vertices connected through edges."""
-    reached, waiting = set(), [next(iter(corners))]
+def _one_piece(faces: Sequence[Rings]) -> list[Problem]:
+    """All faces connected through their vertices (a face connects its own rings)."""
+    at: dict[Point3, list[int]] = defaultdict(list)
+    for i, rings in enumerate(faces):
+        for ring in rings:
+            for point in ring:
+                at[point].append(i)
+    reached, waiting = set(), [0]
     while waiting:
-        point = waiting.pop()
-        if point not in reached:
-            reached.add(point)
-            waiting += [after for _, after in corners[point]]
-    return [] if len(reached) == len(corners) else [Problem("pieces", (), "the faces form more than one shell")]
+        i = waiting.pop()
+        if i not in reached:
+            reached.add(i)
+            waiting += [j for ring in faces[i] for point in ring for j in at[point]]
+    return [] if len(reached) == len(faces) else [Problem("pieces", (), "the faces form more than one shell")]
 
 
 def _intersections(faces: Sequence[Rings], flat: Sequence[Flat]) -> list[Problem]:

@@ -1,9 +1,9 @@
 """Solids: every building as a closed solid on the ground, or the best simpler one that is valid, with the reason.
 
 In: the block's rows of `buildings.parquet`, the DTM. Out: CityJSONSeq (a header line, then one feature per building) and
-`solids.parquet`, the building attributes. A building is tried as a roof of fused planes (LOD2), then with every section flat at its
-mean height (1.3), then as one flat block (1.2); the first whose shells all pass `gate.check` is published, and `lod_reason` says
-what was refused before it. Where none passes the building stays, LOD "0", as its footprint.
+`solids.parquet`, the building attributes. A building is tried as a roof of fused planes (LOD2), then with every section flat
+at its mean height (1.3), then as one flat block (1.2); the first whose shells all pass `gate.check` is published, and
+`lod_reason` says what was refused before it. Where none passes the building stays, LOD "0", as its footprint.
 """
 
 from __future__ import annotations
@@ -292,7 +292,7 @@ def sections_of(table: pa.Table) -> Iterator[tuple[int, Sections]]:
 
 
 def attributes(building: int, sections: Sections, solid: Solid, position_corrected: bool) -> dict[str, Any]:
-    """One row of `ATTRIBUTES`, geometries as shapely objects."""
+    """One row of `ATTRIBUTES`, geometries as shapely objects; of a footprint in several parts the largest."""
     roof = [p[2] for shell in solid.shells for s in shell if s.kind == ROOF for ring in s.rings for p in ring]
     eave, ridge = (min(roof) / MM, max(roof) / MM) if roof else (None, None)
     ground = solid.ground / MM
@@ -312,7 +312,7 @@ def attributes(building: int, sections: Sections, solid: Solid, position_correct
         "footprint_area": round(float(shapely.area(solid.base)), 3),
         "roof_type": solid.roof_type,
         "outline": shapely.MultiPolygon(parts),
-        "footprint": solid.base,
+        "footprint": max(parts, key=shapely.area, default=None),
     }
 
 

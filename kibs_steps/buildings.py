@@ -1,0 +1,210 @@
+"""Buildings: which roof sections belong together.
+
+Two sections share an edge where their outlines run along each other, facing, for at least 0.5 m. In the map frame they seldom
+touch exactly: their planes are fitted apart, and each outline was moved by its own height, so across a step of Δz a
+strip of up to |k·n|·Δz (k the lean, n the edge's normal) was hidden in the image and is missing. A **building** is a connected
+group of sections that share edges, split where the step along the edge is higher than 3 m, and between footprints if given.
+
+In: all blocks' `ground.parquet`. Out: `buildings.parquet`, the same rows with `building_id`, the smallest `section_id` of the
+group, and `block`: the block whose core holds that section's id pixel, so a building is never cut. Blocks and the
+order of sections do not matter.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from kibs_steps import cli, scene, store
+from kibs_steps.errors import KibsError
+from kibs_steps.grid import Tiling
+from kibs_steps.stitch import groups, owner_blocks
+
+SHARED = 0.5  # m, shortest shared edge
+APART = 1.0  # m, how far apart (or over each other) outlines that share an edge may run
+SLACK = 0.5  # m, the same where a step explains the gap
+STEP = 3.0  # m, higher steps divide buildings
+FACING = -0.7  # cosine between the directions of two outlines that face each other
+OVERLAP = 0.25  # m², sections over each other by as much are together
+AT_ONCE = 2_000_000  # edge pairs held in memory
+
+
+class FootprintsUnusable(KibsError):
+    """Footprints that cannot be read as polygons."""
+
+
+def buildings(
+    ids: np.ndarray,
+    outlines: np.ndarray,
+    planes: np.ndarray,
+    lean: tuple[float, float],
+    footprint: np.ndarray | None = None,
+) -> np.ndarray:
+    """Building id (n,) of each section.
+
+    `ids` (n,) section ids; `outlines` (n,) polygons, map frame (m); `planes` (n, 5) as a, b, c, x0, y0 of
+    z = a(x−x0) + b(y−y0) + c; `lean` m per m; `footprint` (n,) number of the footprint each section stands in, −1 none.
+    """
+    order = np.argsort(ids, kind="stable")
+    flat = shapely.force_2d(outlines[order])
+    flat = np.where(shapely.is_missing(flat), shapely.Polygon(), flat)
+    whole = shapely.make_valid(flat)
+    reach = max(APART, SLACK + float(np.hypot(*lean)) * STEP)
+    pairs = shapely.STRtree(whole).query(whole, predicate="dwithin", distance=reach).T
+    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
+    if footprint is not None:
+        pairs = pairs[footprint[order][pairs[:, 0]] == footprint[order][pairs[:, 1]]]
+    length, step = shared_edges(flat, planes[order], pairs, lean)
+    long = length >= SHARED
+    together = long & (step <= STEP)
+    rest = np.flatnonzero(~long)
+    together[rest] = _overlapping(whole, planes[order], pairs[rest])
+    group = groups(len(ids), pairs[together])
+    smallest = np.full(group.max(initial=-1) + 1, np.iinfo(np.int64).max)
+    np.minimum.at(smallest, group, ids[order])
+    result = np.empty(len(ids), np.int64)
+    result[order] = smallest[group]
+    return result
+
+
+def shared_edges(
+    outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray, lean: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Length (m) of the edge that each pair (m, 2) of sections shares, and the mean height of the step along it (m)."""
+    parts, section = shapely.get_parts(outlines, return_index=True)
+    rings, part = shapely.get_rings(shapely.orient_polygons(parts), return_index=True)
+    xy, ring = shapely.get_coordinates(rings, return_index=True)
+    edge = np.flatnonzero(np.diff(ring) == 0)
+    start, end = xy[edge], xy[edge + 1]
+    of = section[part[ring[edge]]]
+    by = np.argsort(of, kind="stable")
+    start, end, of = start[by], end[by], of[by]
+    first = np.searchsorted(of, np.arange(len(outlines) + 1))
+    count = np.diff(first)
+    combinations = count[pairs[:, 0]] * count[pairs[:, 1]]
+    length, moment = np.zeros(len(pairs)), np.zeros(len(pairs))
+    cuts = np.flatnonzero(np.diff(np.cumsum(combinations) // AT_ONCE)) + 1
+    for some in np.split(np.arange(len(pairs)), cuts):
+        a, b = pairs[some].T
+        pair = np.repeat(some, combinations[some])
+        k = np.arange(len(pair)) - np.repeat(np.cumsum(combinations[some]) - combinations[some], combinations[some])
+        width = np.repeat(count[b], combinations[some])
+        i = np.repeat(first[a], combinations[some]) + k // np.maximum(width, 1)
+        j = np.repeat(first[b], combinations[some]) + k % np.maximum(width, 1)
+        along, step = _facing(start, end, of, planes, i, j, lean)
+        length += np.bincount(pair, along, minlength=len(pairs))
+        moment += np.bincount(pair, along * step, minlength=len(pairs))
+    return length, moment / np.maximum(length, 1e-9)
+
+
+def _facing(
+    start: np.ndarray,
+    end: np.ndarray,
+    of: np.ndarray,
+    planes: np.ndarray,
+    i: np.ndarray,
+    j: np.ndarray,
+    lean: tuple[float, float],
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far (m) edges i and j run along each other, and the step (m) there; 0 m where they do not."""
+    span = end - start
+    size = np.maximum(np.hypot(*span.T), 1e-9)
+    u = span / size[:, None]
+    facing = (u[i] * u[j]).sum(axis=1) <= FACING
+    from_j = ((start[j] - start[i]) * u[i]).sum(axis=1)
+    to_j = ((end[j] - start[i]) * u[i]).sum(axis=1)
+    low = np.maximum(np.minimum(from_j, to_j), 0.0)
+    high = np.minimum(np.maximum(from_j, to_j), size[i])
+    along = np.where(facing, np.maximum(high - low, 0.0), 0.0)
+    middle = (low + high) / 2
+    turn = to_j - from_j
+    t = np.clip((middle - from_j) / np.where(np.abs(turn) < 1e-9, 1.0, turn), 0.0, 1.0)
+    here, there = start[i] + middle[:, None] * u[i], start[j] + t[:, None] * span[j]
+    step = np.abs(_heights(planes[of[i]], here) - _heights(planes[of[j]], there))
+    normal = np.stack([u[i][:, 1], -u[i][:, 0]], axis=1)
+    hidden = SLACK + np.abs(normal @ np.asarray(lean, float)) * np.minimum(step, STEP)
+    near = np.abs(((there - here) * normal).sum(axis=1)) <= np.maximum(APART, hidden)
+    return np.where(near, along, 0.0), step
+
+
+def _heights(planes: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Heights (n,) of planes (n, 5) at positions (n, 2)."""
+    return planes[:, 0] * (xy[:, 0] - planes[:, 3]) + planes[:, 1] * (xy[:, 1] - planes[:, 4]) + planes[:, 2]
+
+
+def _overlapping(outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """(m,) bool: pairs that cover each other by `OVERLAP` with a step of at most `STEP` there, as a dormer its roof."""
+    together = np.zeros(len(pairs), bool)
+    if len(pairs):
+        touch = np.flatnonzero(shapely.intersects(outlines[pairs[:, 0]], outlines[pairs[:, 1]]))
+        shared = shapely.intersection(outlines[pairs[touch, 0]], outlines[pairs[touch, 1]])
+        large = shapely.area(shared) >= OVERLAP
+        touch = touch[large]
+        centre = shapely.get_coordinates(shapely.centroid(shared[large]))
+        first, second = (_heights(planes[pairs[touch, k]], centre) for k in (0, 1))
+        together[touch] = np.abs(first - second) <= STEP
+    return together
+
+
+def standing_in(outlines: np.ndarray, footprints: np.ndarray) -> np.ndarray:
+    """Number (n,) of the footprint that each section overlaps most, −1 none."""
+    sections, footprints = shapely.make_valid(shapely.force_2d(outlines)), shapely.make_valid(footprints)
+    section, footprint = shapely.STRtree(footprints).query(sections, predicate="intersects")
+    area = shapely.area(shapely.intersection(sections[section], footprints[footprint]))
+    order = np.lexsort((-footprint, area))  # the largest area, then the first footprint, is written last
+    found = np.full(len(outlines), -1)
+    found[section[order]] = np.where(area[order] > 0, footprint[order], -1)
+    return found
+
+
+def read_footprints(path: str | Path, crs: str) -> np.ndarray:
+    """The polygons of a vector file, in `crs`. Raises `FootprintsUnusable`."""
+    import geopandas
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    try:
+        frame = geopandas.read_file(path)
+    except (DataSourceError, DataLayerError) as error:
+        raise FootprintsUnusable(f"footprints {path} cannot be read ({error}): give a GeoPackage or GeoJSON") from error
+    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])]
+    if frame.empty:
+        raise FootprintsUnusable(f"footprints {path} holds no polygons: give a layer of building outlines")
+    if frame.crs is None:
+        raise FootprintsUnusable(f"footprints {path} says no CRS: assign one")
+    return shapely.force_2d(frame.to_crs(crs).geometry.to_numpy())
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Group the sections of all blocks to buildings."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.buildings", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--tile", type=int, required=True, help="tile side, px")
+    parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
+    parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--footprints", help="polygons that divide buildings")
+    parser.add_argument("--ground", nargs="+", required=True, help="ground.parquet of every block")
+    parser.add_argument("--out", required=True, help="out: buildings.parquet of all blocks")
+    args = parser.parse_args(argv)
+    facts = scene.read(args.scene)
+    tiling = Tiling(args.tile, args.margin, args.block)
+    table = pa.concat_tables([store.read_table(path) for path in args.ground])
+    outlines = shapely.from_wkb(table["outline_map"].to_numpy(zero_copy_only=False), on_invalid="ignore")
+    planes = np.stack([table[name].to_numpy() for name in ("plane_a", "plane_b", "plane_c", "x0", "y0")], axis=1)
+    footprint = standing_in(outlines, read_footprints(args.footprints, facts.grid.crs)) if args.footprints else None
+    building = buildings(table["section_id"].to_numpy(), outlines, planes, facts.lean, footprint)
+    table = table.append_column("building_id", pa.array(building))
+    table = table.sort_by([("building_id", "ascending"), ("section_id", "ascending")])
+    block_of = owner_blocks(table["building_id"].to_numpy(), facts.grid, tiling)
+    by_block = {}
+    for block in tiling.blocks(facts.grid.width, facts.grid.height):
+        mine = np.flatnonzero((block_of == (block.row, block.col)).all(axis=1))
+        by_block[block.name] = table.take(pa.array(mine))
+    store.write_by_block(args.out, by_block)
+
+
+if __name__ == "__main__":
+    cli.run(main)
