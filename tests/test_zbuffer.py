@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from kibs_steps.grid import Grid
 from kibs_steps.view import lean
 from kibs_steps.zbuffer import Polygon, heights_on, pixel_counts, planes, render_faces

@@ -179,15 +179,19 @@ def _suburb(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
                     )
                 elif garden < 0.6:
                     site.paint(
-                        site.place(s + w / 2, np.mean(yard)).put(
-                            rng.normal(0, 3, (5, 2))[np.argsort(rng.uniform(0, 6, 5))]
-                        ),
+                        site.place(s + w / 2, np.mean(yard)).put(_blob(rng, rng.uniform(1.5, 4.5))),
                         "soil",
                     )
                 site.trees(s, yard[0], s + w, yard[1], site.leafy * rng.uniform(0, 1.6), 7)
             _hedge(site, s, near, s, far, 0.5)
             s += w
     _hedge(site, s0, back, s1, back, 0.7)
+
+
+def _blob(rng: np.random.Generator, radius: float) -> np.ndarray:
+    """A roundish ring (n, 2) m."""
+    angle = np.linspace(0, 2 * np.pi, 9, endpoint=False)
+    return radius * rng.uniform(0.6, 1.2, (9, 1)) * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def _hedge(site: Site, s0: float, t0: float, s1: float, t1: float, chance: float) -> None:
@@ -507,7 +511,9 @@ def _centre(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
         eave = max(3.0, top * rng.uniform(0.3, 1.1))
         if rng.random() < 0.72:
             plan = [wing("flat", -w / 2, -h / 2, w / 2, h / 2, eave, 0)]
-            if rng.random() < 0.35 and w > 12:  # a tower and a lower part
+            if rng.random() < 0.2:
+                plan = [Wing(_odd(rng, w, h), plan[0].planes)]
+            elif rng.random() < 0.35 and w > 12:  # a tower and a lower part
                 cut = rng.uniform(-0.2, 0.2) * w
                 plan = [
                     wing("flat", -w / 2, -h / 2, cut, h / 2, eave, 0),
@@ -535,6 +541,19 @@ def _centre(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
             _tall(site, place._replace(angle=place.angle + np.pi / 2), h, w, eave, None, None, None)
 
     fill(s0, t0, s1, t1)
+
+
+def _odd(rng: np.random.Generator, w: float, h: float) -> list[tuple[float, float]]:
+    """A convex plan within w×h that is no rectangle: cut corners, a slanted side, or round."""
+    if rng.random() < 0.25:
+        angle = np.linspace(0, 2 * np.pi, int(rng.integers(6, 20)), endpoint=False)
+        return [(w / 2 * float(np.cos(a)), h / 2 * float(np.sin(a))) for a in angle]
+    ring = roofs.rectangle(-w / 2, -h / 2, w / 2, h / 2)
+    for _ in range(int(rng.integers(1, 3))):
+        a = rng.uniform(0, 2 * np.pi)
+        reach = abs(np.cos(a)) * w / 2 + abs(np.sin(a)) * h / 2
+        ring = roofs.clip(ring, -float(np.cos(a)), -float(np.sin(a)), float(reach - rng.uniform(0.1, 0.35) * min(w, h)))
+    return ring
 
 
 def _parking(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
@@ -634,9 +653,7 @@ def _rooflights(site: Site, number: int) -> None:
         for u in np.arange(gap / 2, width - wide, gap):
             if axes.holds(u, depth * 0.15, u + wide, depth * 0.85):
                 slab = roofs.slab(axes, u, depth * 0.15, u + wide, depth * 0.85, 0.08)
-                site.faces.append(
-                    Face(slab, (), CLUTTER, 0, number, site.kit.uses["skylight"][1], (1, 1, 1), face.section)
-                )
+                site.faces.append(Face(slab, (), CLUTTER, 0, number, site.kit.uses["skylight"][1], (1, 1, 1)))
 
 
 def _yard(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
@@ -786,7 +803,7 @@ def _park(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
     """No buildings: park, water, sport, wood, rails."""
     rng = site.rng
     what = pick(rng, ["park", "wood", "water", "sport", "rails", "square"])
-    site.paint_street(s0, t0, s1, t1, {"rails": "gravel", "square": "pavement"}.get(what, "lawn"))
+    site.paint_street(s0, t0, s1, t1, {"rails": "soil", "square": "pavement"}.get(what, "lawn"))
     cs, ct = (s0 + s1) / 2, (t0 + t1) / 2
     place = site.place(cs, ct)
     w, h = (s1 - s0) / 2, (t1 - t0) / 2

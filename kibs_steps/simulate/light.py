@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from kibs_steps import zbuffer
-from kibs_steps.simulate.site import TREE, WALL, Face, Paint
+from kibs_steps.simulate.site import ROOF, TREE, WALL, Face, Paint
 from kibs_steps.simulate.surfaces import Material
 
 SIDE = 512  # samples of the noise, 0.25 m each
@@ -32,6 +32,7 @@ class Surfaces(NamedTuple):
     shift: np.ndarray  # (n, 2) place in the noise
     upright: np.ndarray  # (n,) a wall
     leafy: np.ndarray  # (n,) a tree
+    rim: np.ndarray  # (n,) strength of the lines along its edges, 0 off roof sections
 
 
 class Light(NamedTuple):
@@ -103,6 +104,7 @@ def surfaces(faces: list[Face], paints: list[Paint], materials: list[Material], 
     tint = np.array([f.tint for f in faces] + [p.tint for p in paints])
     kind = np.array([f.kind for f in faces] + [-1] * m)
     colour = np.array([c.colour for c in materials])[material] * tint
+    rim = np.array([c.rim for c in materials], np.float32)[material]
     single = [origin, u, v, length, normal, colour]
     return Surfaces(
         *(a.astype(np.float32) for a in single),
@@ -110,6 +112,7 @@ def surfaces(faces: list[Face], paints: list[Paint], materials: list[Material], 
         rng.integers(0, SIDE, (n + m, 2)).astype(np.float32),
         kind == WALL,
         kind == TREE,
+        np.where(kind == ROOF, rim, 0.0),
     )
 
 
@@ -144,10 +147,6 @@ def albedo(
         some = np.flatnonzero(of(period) > 0)
         phase = along[some] / of(period)[some]
         change[some] -= of(depth)[some] * ((phase - np.floor(phase)) < 0.3)
-    rim = of("rim")
-    some = np.flatnonzero(rim != 0)
-    edge = (v[some] < 0.22) | (table.length[index[some]] - v[some] < 0.25)
-    change[some] += rim[some] * edge
     colour = table.colour[index] * np.clip(1 + change, 0.15, 2.5)[:, None]
     some = np.flatnonzero(table.upright[index] & (of("storey") > 0))
     if len(some):

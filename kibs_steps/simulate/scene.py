@@ -176,7 +176,8 @@ def render(
     samples = _sample_frame(grid)
     city = _near(city, terrain, samples, view.lean, sun.lean)
     seen = _see(city, terrain, samples, view.lean)
-    shine = _shine(city, seen, samples, sun, rng, backgrounds)
+    sections = _truth(city, terrain, grid, view.lean, seen.section)
+    shine = _shine(city, seen, samples, sun, rng, sections, backgrounds)
     rgb = camera.photograph(shine, look or camera.camera(rng), rng)
 
     at = np.s_[1::2, 1::2]
@@ -189,7 +190,6 @@ def render(
         seen_at = grid.to_map(np.stack([cols + 0.5, rows + 0.5], -1))
         true_at = seen_at + (z[on] - terrain(seen_at))[:, None] * np.array(view.lean)
         height[on] = z[on] - terrain(true_at)
-    sections = _truth(city, terrain, grid, view.lean, seen.section)
     corners = _corners(sections, section)
     return Rendering(rgb, section, height, sections, *corners)
 
@@ -200,6 +200,7 @@ def _shine(
     samples: Grid,
     sun: Direction,
     rng: np.random.Generator,
+    sections: list[SectionTruth],
     backgrounds: list[tuple[np.ndarray, np.ndarray]] | None,
 ) -> np.ndarray:
     """Radiance (rows, cols, 3) float32 of all samples, worked out in strips of rows to bound the memory."""
@@ -214,6 +215,7 @@ def _shine(
     facing = (table.normal @ toward > 0) | table.leafy
     lit = _lit(city, seen, samples, sun.lean, facing[index])
     sky = light.openness((seen.points[..., 2] - seen.ground).astype(np.float32), samples.gsd)
+    rims = 1 + _rims(city, sections, shape, rng) * (table.rim[index] != 0)
     photograph = _photograph(shape, backgrounds, rng) if backgrounds else None
     shine = np.empty((*shape, 3), np.float32)
     for start in range(0, shape[0], STRIP):
@@ -225,10 +227,28 @@ def _shine(
             chosen = (which >= len(city.faces)) & photograph[1][rows].ravel()
             colour[chosen] = photograph[0][rows].reshape(-1, 3)[chosen]
         light_here = light.radiance(
-            colour, table.normal[which], table.leafy[which], lit[rows].ravel(), sky[rows].ravel(), source
+            colour * rims[rows].reshape(-1, 1),
+            table.normal[which],
+            table.leafy[which],
+            lit[rows].ravel(),
+            sky[rows].ravel(),
+            source,
         )
         shine[rows] = light_here.reshape(-1, shape[1], 3)
     return shine
+
+
+def _rims(city: City, sections: list[SectionTruth], shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """Relative brightness (rows, cols) float32 of the lines of tiles and gutters along the edges of sections."""
+    canvas = np.zeros(shape, np.float32)
+    rim = {f.section: city.materials[f.material].rim for f in city.faces if f.section}
+    strength: dict[int, float] = {}
+    for s in sections:
+        factor = strength.setdefault(s.building, max(0.0, rng.uniform(-0.5, 1.5)))
+        if s.visible and rim[s.section] * factor:
+            ring = np.round(s.outline_seen[:, :2] * 32).astype(np.int32)
+            cv2.polylines(canvas, [ring], True, rim[s.section] * factor, 1, cv2.LINE_8, 4)
+    return canvas
 
 
 def _extents(rings: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """A city being built: its faces, ground paints and materials, and what may stand there.
 
-A **section** is one planar part of a roof, numbered from 1; what lies *on* a section (dormer, chimney, solar panel) names it in
-`on` and belongs to none. Streets form a grid (coordinates s, t in m) that is bent and turned as a whole, so plots stay simple
+A **section** is one planar part of a roof, numbered from 1; what lies on a section (dormer, chimney, solar panel) is none.
+Streets form a grid (coordinates s, t in m) that is bent and turned as a whole, so plots stay simple
 while streets curve. A raster of occupied ground keeps buildings from standing in each other.
 
 In: a random generator, a terrain, a palette, an area in map metres. Out: lists of `Face` and `Paint`.
@@ -42,7 +42,6 @@ class Face(NamedTuple):
     building: int = 0
     material: int = 0
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    on: int = 0
 
 
 class Paint(NamedTuple):
@@ -238,11 +237,10 @@ class Site:
             self.faces.append(
                 Face(place.put(ring), hole, ROOF, self.sections if not hole else self.sections - 1, number, roof, tint)
             )
-            section = self.faces[-1].section
             if parapet:
-                self._parapet(place, ring, parapet, section, number, wall, paint)
+                self._parapet(place, ring, parapet, number, wall, paint)
             if furnish:
-                self._furnish(place, ring, section, number, roof, tint, wall, paint)
+                self._furnish(place, ring, number, roof, tint, wall, paint)
         for quad in roofs.walls(rings, overhang):
             self.faces.append(Face(place.put(quad), (), WALL, 0, number, wall, paint))
         return number
@@ -267,18 +265,15 @@ class Site:
         self.faces += [Face(place.put(side), (), WALL, 0, number, wall, self.tint(0.03)) for side in sides]
         return (place.put(foot),)
 
-    def _on(
-        self, place: Place, rings: list[np.ndarray], section: int, number: int, material: int, tint: float = 0.06
-    ) -> None:
+    def _on(self, place: Place, rings: list[np.ndarray], number: int, material: int, tint: float = 0.06) -> None:
         shade = self.tint(tint)
-        self.faces += [Face(place.put(ring), (), CLUTTER, 0, number, material, shade, section) for ring in rings]
+        self.faces += [Face(place.put(ring), (), CLUTTER, 0, number, material, shade) for ring in rings]
 
     def _parapet(
         self,
         place: Place,
         ring: np.ndarray,
         height: float,
-        section: int,
         number: int,
         wall: int,
         tint: tuple[float, float, float],
@@ -297,13 +292,12 @@ class Site:
             j = (i + 1) % len(ring)
             quads = [[top[i], top[j], top_inner[j], top_inner[i]], [low_outer[i], low_outer[j], top[j], top[i]]]
             quads.append([inner[j], inner[i], top_inner[i], top_inner[j]])
-            self.faces += [Face(place.put(np.array(q)), (), CLUTTER, 0, number, cap, tint, section) for q in quads]
+            self.faces += [Face(place.put(np.array(q)), (), CLUTTER, 0, number, cap, tint) for q in quads]
 
     def _furnish(
         self,
         place: Place,
         ring: np.ndarray,
-        section: int,
         number: int,
         roof: int,
         tint: tuple[float, float, float],
@@ -323,7 +317,7 @@ class Site:
                 w, d = min(width * rng.uniform(0.3, 0.9), 12), depth * rng.uniform(0.35, 0.8)
                 u, v = rng.uniform(0, width - w), rng.uniform(0.2, 0.8) * (depth - d)
                 if axes.holds(u, v, u + w, v + d):
-                    self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.1)], section, number, draw(rng, "solar"))
+                    self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.1)], number, draw(rng, "solar"))
                     return
             if axes.rise > 0.45 and width > 4 and rng.random() < 0.45 * much:
                 gable, w, h = rng.random() < 0.5, rng.uniform(1.2, 2.6), rng.uniform(0.9, 1.6)
@@ -332,10 +326,8 @@ class Site:
                 for i in range(count):
                     made = roofs.dormer(axes, width * (i + 0.5) / count, v, w, h, gable)
                     if made:
-                        self.faces += [Face(place.put(r), (), CLUTTER, 0, number, roof, tint, section) for r in made[0]]
-                        self.faces += [
-                            Face(place.put(r), (), CLUTTER, 0, number, wall, paint, section) for r in made[1]
-                        ]
+                        self.faces += [Face(place.put(r), (), CLUTTER, 0, number, roof, tint) for r in made[0]]
+                        self.faces += [Face(place.put(r), (), CLUTTER, 0, number, wall, paint) for r in made[1]]
             elif rng.random() < 0.6 * much:
                 for _ in range(int(rng.integers(1, 4))):
                     u, v, w = rng.uniform(0.1, 0.85) * width, rng.uniform(0.2, 0.7) * depth, rng.uniform(0.6, 1.2)
@@ -343,7 +335,6 @@ class Site:
                         self._on(
                             place,
                             [roofs.slab(axes, u, v, u + w, v + 1.3 * w, 0.05)],
-                            section,
                             number,
                             draw(rng, "skylight"),
                         )
@@ -354,7 +345,7 @@ class Site:
                     top, sides = roofs.prism(
                         foot[:, :2], float(foot[:, 2].min()), float(foot[:, 2].max()) + rng.uniform(0.4, 1.4)
                     )
-                    self._on(place, [top, *sides], section, number, draw(rng, "chimney"))
+                    self._on(place, [top, *sides], number, draw(rng, "chimney"))
             return
         count = rng.poisson(min(width * depth / 90, 14) * 1.2 * much)
         for _ in range(count):
@@ -364,12 +355,12 @@ class Site:
                 continue
             foot = roofs.slab(axes, u, v, u + w, v + d, 0.0)
             if rng.random() < 0.3:
-                self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.15)], section, number, draw(rng, "skylight"))
+                self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.15)], number, draw(rng, "skylight"))
             else:
                 top, sides = roofs.prism(
                     foot[:, :2], float(foot[:, 2].min()) - 0.2, float(foot[:, 2].max()) + rng.uniform(0.4, 2.4)
                 )
-                self._on(place, [top, *sides], section, number, draw(rng, "metal"), 0.2)
+                self._on(place, [top, *sides], number, draw(rng, "metal"), 0.2)
         if rng.random() < 0.6 * self.solar and axes.rise < 0.1:
             gap = rng.uniform(1.6, 2.6)
             for v in np.arange(1.0, depth - 1.5, gap)[:25]:
@@ -377,7 +368,7 @@ class Site:
                 if axes.holds(u0, v, u1, v + gap * 0.6):
                     quad = roofs.slab(axes, u0, v, u1, v + gap * 0.6, 0.1)
                     quad[2:, 2] += 0.35
-                    self._on(place, [quad], section, number, self.kit.uses["solar"][0])
+                    self._on(place, [quad], number, self.kit.uses["solar"][0])
 
     # What stands on the ground.
 

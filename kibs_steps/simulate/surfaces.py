@@ -23,7 +23,7 @@ class Material(NamedTuple):
     course_depth: float = 0.0
     seam: float = 0.0  # period of lines down the slope
     seam_depth: float = 0.0
-    rim: float = 0.0  # eave and ridge lines: brighter (> 0) or darker
+    rim: float = 0.0  # lines along eaves, ridges and hips: brighter (> 0) or darker
     storey: float = 0.0  # storey height of windows
     bay: float = 0.0  # distance of windows along the wall
     glass: float = 0.3  # share of a bay that is window
@@ -350,8 +350,8 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
     add("tree", [Material(_jitter(rng, c, 0.2), 0.2, 0.15, leaf=thick) for c in leaves])
     add("bare", [Material(_jitter(rng, (0.085, 0.075, 0.06), 0.15), 0.2, 0.25, leaf=0.5)])
     cars = [
-        (0.65, 0.65, 0.65),
-        (0.4, 0.4, 0.41),
+        (0.55, 0.55, 0.55),
+        (0.36, 0.4, 0.41),
         (0.05, 0.05, 0.055),
         (0.18, 0.18, 0.19),
         (0.30, 0.04, 0.035),
@@ -359,7 +359,7 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
         (0.45, 0.4, 0.3),
         (0.04, 0.14, 0.09),
     ]
-    add("car", [Material(c, 0.02, 0.02) for c in cars], [5, 4, 4, 4, 1.2, 1.2, 0.5, 0.3])
+    add("car", [Material(c, 0.02, 0.02) for c in cars], [3.5, 4, 4.5, 4.5, 1.3, 1.3, 0.6, 0.4])
     add("glass", [Material((0.04, 0.05, 0.06), 0.05, 0.02)])
     add(
         "solar",

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import shapely
-from kibs_steps.simulate.roofs import KINDS, Wing, dormer, frame_of, rectangle, sections, walls, wing
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
+
+from kibs_steps.simulate.roofs import KINDS, Wing, dormer, frame_of, rectangle, sections, walls, wing
 
 
 def plan(ring):
