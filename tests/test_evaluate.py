@@ -167,16 +167,32 @@ def test_azimuths_across_north():
     assert evaluate.plane_figures(np.array([g[0]]), np.array([g[1]]))["azimuth_mae"] == pytest.approx(3)
 
 
+def corners(points, heights, seen=True):
+    return Corners(np.array(points, float), np.array(heights, float), np.broadcast_to(seen, len(heights)))
+
+
 def test_corners_each_once():
-    true = Corners(np.array([[10.0, 10], [20, 10], [30, 10], [50, 50]]), np.array([5.0, 5, 8, 8]))
-    found = Corners(np.array([[10.0, 11], [10.5, 10], [20, 12.5], [30, 10]]), np.array([4.0, 6, 5, 8.5]))
+    true = corners([[10, 10], [20, 10], [30, 10], [50, 50]], [5, 5, 8, 8])
+    found = corners([[10, 11], [10.5, 10], [20, 12.5], [30, 10]], [4, 6, 5, 8.5])
     figures = evaluate.corner_figures(true, found)
     assert figures["matched"] == 2
     assert (figures["precision"], figures["recall"]) == (0.5, 0.5)
     assert figures["position_mae_px"] == pytest.approx(0.25)
     assert figures["height_mae"] == pytest.approx(0.75)
-    shared = evaluate.merge_corners(Corners(np.array([[1.0, 1], [1.2, 1], [1, 1], [9, 9]]), np.array([5.0, 5, 9, 5])))
+
+
+def test_hidden_corners_neither_count_nor_harm():
+    true = corners([[10, 10], [20, 10], [30, 10]], [5, 5, 5], [True, False, False])
+    figures = evaluate.corner_figures(true, corners([[10, 10], [20, 10], [40, 10]], [5, 5, 5]))
+    assert (figures["truth"], figures["predicted"], figures["matched"]) == (1, 2, 1)
+
+
+def test_shared_corners_are_one():
+    shared = evaluate.merge_corners(
+        corners([[1, 1], [1.2, 1], [1, 1], [9, 9]], [5, 5, 9, 5], [False, True, False, False])
+    )
     assert len(shared.height) == 3
+    assert shared.seen.sum() == 1
 
 
 def run(folder, scene, found=None, true=None, **extra):

@@ -82,11 +82,12 @@ def outlines(wkb: pa.ChunkedArray) -> pa.Array:
     return pa.array(shapely.to_wkb(shapes), pa.binary(), from_pandas=True)
 
 
-def plane_polygons(wkb: pa.ChunkedArray) -> pa.Array:
-    """Polygons without z (WKB, nulls and empty ones null)."""
-    shapes = shapely.force_2d(shapely.from_wkb(wkb.to_numpy()))
-    shapes[shapely.is_empty(shapes)] = None
-    return pa.array(shapely.to_wkb(shapes), pa.binary(), from_pandas=True)
+def footprints(solids: pa.Table) -> pa.Table:
+    """Layer `footprints`: a row per polygon, so that a building whose parts do not touch has several."""
+    shapes = shapely.force_2d(shapely.from_wkb(solids["footprint"].to_numpy()))
+    parts, owner = shapely.get_parts(shapes, return_index=True)
+    rows = solids.select(list(FOOTPRINT_COLUMNS)).take(pa.array(owner, pa.int64()))
+    return rows.append_column(GEOMETRY, pa.array(shapely.to_wkb(parts), pa.binary()))
 
 
 def blocks(tiling: Tiling, grid: Grid, known: dict[str, dict[str, str]]) -> pa.Table:
@@ -110,7 +111,7 @@ def layers(sections: pa.Table, solids: pa.Table, corners: pa.Table) -> dict[str,
     points = shapely.points(*(corners[name].to_numpy() for name in ("x", "y", "z")))
     return {
         "buildings": ("MultiPolygon", layer(solids, BUILDING_COLUMNS, outlines(solids["outline"]))),
-        "footprints": ("Polygon", layer(solids, FOOTPRINT_COLUMNS, plane_polygons(solids["footprint"]))),
+        "footprints": ("Polygon", footprints(solids)),
         "roof_sections": ("Polygon Z", layer(sections, SECTION_COLUMNS, sections["outline_map"])),
         "roof_sections_image": ("Polygon Z", layer(sections, SECTION_COLUMNS, sections["outline_seen"])),
         "corners": ("Point Z", layer(corners, CORNER_COLUMNS, pa.array(shapely.to_wkb(points), pa.binary()))),

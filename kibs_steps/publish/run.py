@@ -1,0 +1,215 @@
+"""Run: `run.json`, what made these results and how it went. The only published file that two runs may differ in.
+
+In: the scene, the input files, the models' contracts, the settings, the tables of results, and the benchmark files Snakemake
+writes (`benchmark:`), one per job. Out: versions, hashes, settings, licences, counts per status and level of detail, reasons
+of fallbacks, times per step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import platform
+import re
+from collections import Counter
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from kibs_steps import cli, fingerprint, store
+from kibs_steps import scene as scenes
+from kibs_steps.errors import KibsError
+from kibs_steps.publish import licences
+from kibs_steps.scene import Scene
+
+LIBRARIES = (
+    "kibs-steps",
+    "snakemake",
+    "numpy",
+    "scipy",
+    "rasterio",
+    "pyproj",
+    "shapely",
+    "pyogrio",
+    "pyarrow",
+    "onnx",
+    "onnxruntime",
+    "opencv-python-headless",
+    "scikit-image",
+    "pillow",
+)
+MOST = 20  # reasons listed
+
+
+class InputMissing(KibsError):
+    """An input of the run that is not there any more."""
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python, of this package and of the libraries results depend on; None for what is not installed."""
+    import pyogrio
+    import pyproj
+    import rasterio
+    import shapely
+
+    found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = None
+    found["gdal (rasterio)"] = rasterio.__gdal_version__
+    found["gdal (pyogrio)"] = ".".join(map(str, pyogrio.__gdal_version__))
+    return {**found, "proj": pyproj.proj_version_str, "geos": shapely.geos_version_string}
+
+
+def inputs(paths: list[str], cache: Path) -> list[dict[str, Any]]:
+    """File, size (bytes) and sha256 of the inputs; `cache` as in `fingerprint.of_file`. Raises `InputMissing`."""
+    for path in paths:
+        if not Path(path).is_file():
+            raise InputMissing(f"input {path} is gone: put it back, or build the scene again from its new place")
+    return [
+        {"file": path, "bytes": Path(path).stat().st_size, "sha256": fingerprint.of_file(path, cache)} for path in paths
+    ]
+
+
+def model_summary(path: str) -> dict[str, Any]:
+    """What matters of one `models/{task}.json`: file, hash, licence, grid, head, what it was trained on."""
+    content = store.read_json(path)
+    contract = content["contract"]
+    trained = contract["trained_on"]
+    kept = {
+        key: contract[key] for key in ("task", "head", "gsd", "tile", "margin", "blend", "metrics") if key in contract
+    }
+    heights = contract.get("heights")
+    if heights:
+        kept["heights"] = {
+            "bins": len(heights["centres"]),
+            "highest": heights["edges"][-1],
+            "fallback": heights["fallback"],
+        }
+    return {
+        "file": content["file"],
+        "sha256": content["sha256"],
+        "licence": trained["licence"],
+        **kept,
+        "trained_on": trained,
+    }
+
+
+def counted(values: list[Any]) -> dict[str, int]:
+    """How often each value occurs, most frequent first, then by name."""
+    counts = Counter(str(value) for value in values if value is not None)
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+
+def reasons(texts: list[str | None]) -> dict[str, int]:
+    """How often each reason was given, its numbers left out so that like reasons count together; the `MOST` frequent."""
+    alike = [re.sub(r"-?\d[\d,]*(\.\d+)?", "#", text) for text in texts if text]
+    return dict(list(counted(alike).items())[:MOST])
+
+
+def results(sections: pa.Table, solids: pa.Table) -> dict[str, Any]:
+    """Counts of sections per status and split, of buildings per level of detail, and why some are less than they could be."""
+    return {
+        "sections": {
+            "count": sections.num_rows,
+            "status": counted(sections["status"].to_pylist()),
+            "split": counted(sections["split"].to_pylist()),
+            "reasons": reasons(sections["status_reason"].to_pylist()),
+        },
+        "buildings": {
+            "count": solids.num_rows,
+            "lod": counted(solids["lod"].to_pylist()),
+            "valid": sum(map(bool, solids["valid"].to_pylist())),
+            "position_corrected": sum(map(bool, solids["position_corrected"].to_pylist())),
+            "roof_type": counted(solids["roof_type"].to_pylist()),
+            "reasons": reasons(solids["lod_reason"].to_pylist()),
+        },
+    }
+
+
+def times(folder: str | Path) -> dict[str, dict[str, float | int]]:
+    """Jobs, seconds (sum and longest) and peak memory (MB) per step, from Snakemake's benchmark files below `folder`.
+
+    A step is a file `STEP.tsv` or a folder `STEP/` with one file per block.
+    """
+    steps: dict[str, list[tuple[float, float]]] = {}
+    folder = Path(folder)
+    for path in sorted(folder.rglob("*.tsv")):
+        place = path.relative_to(folder)
+        step = place.parts[0] if len(place.parts) > 1 else place.stem
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file, delimiter="\t"):
+                try:
+                    spent = float(row["s"]), float(row["max_rss"])
+                except (KeyError, TypeError, ValueError):  # a job too short to be measured has "-" or "NA" for memory
+                    spent = float(row["s"]) if row.get("s") else 0.0, 0.0
+                steps.setdefault(step, []).append(spent)
+    return {
+        step: {
+            "jobs": len(spent),
+            "seconds": round(sum(s for s, _ in spent), 3),
+            "longest": round(max(s for s, _ in spent), 3),
+            "peak_mb": round(max(m for _, m in spent), 1),
+        }
+        for step, spent in steps.items()
+    }
+
+
+def facts(scene: Scene) -> dict[str, Any]:
+    """What is known of the raster: grid, directions, how it was projected."""
+    return {
+        "name": scene.name,
+        "grid": scene.grid._asdict(),
+        "bands": scene.bands,
+        "view": scene.view and scene.view._asdict(),
+        "sun": scene.sun and scene.sun._asdict(),
+        "projection_height": scene.projection_height,
+        "position_corrected": scene.view is not None,
+    }
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Write down what made a scene's results."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.run", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--inputs", nargs="*", default=[], help="raster, terrain, truth …: hashed")
+    parser.add_argument("--models", nargs="*", default=[], help="models/*.json")
+    parser.add_argument("--settings", default="{}", help="the scene's settings, JSON text")
+    parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
+    parser.add_argument("--solids", required=True, nargs="+", help="solids.parquet of all blocks")
+    parser.add_argument("--benchmarks", help="folder of Snakemake's benchmark files")
+    parser.add_argument("--out", required=True, help="out: run.json")
+    args = parser.parse_args(argv)
+    scene = scenes.read(args.scene)
+    sections, solids = (
+        pa.concat_tables([store.read_table(path, columns) for path in paths], promote_options="permissive")
+        for paths, columns in (
+            (args.sections, ["status", "status_reason", "split"]),
+            (args.solids, ["lod", "lod_reason", "valid", "position_corrected", "roof_type"]),
+        )
+    )
+    line = licences.line(args.models)
+    content = {
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "scene": facts(scene),
+        "licence": line,
+        "models": [model_summary(path) for path in args.models],
+        "settings": json.loads(args.settings),
+        "inputs": inputs(args.inputs, scene.folder.parent / ".fingerprints.json"),
+        "results": results(sections, solids),
+        "times": times(args.benchmarks) if args.benchmarks else {},
+        "versions": versions(),
+    }
+    store.write_json(args.out, content)
+    if line:
+        print(f"licence of the models: {line}")
+
+
+if __name__ == "__main__":
+    cli.run(main)
