@@ -53,7 +53,7 @@ def buildings(
     flat = shapely.force_2d(outlines[order])
     flat = np.where(shapely.is_missing(flat), shapely.Polygon(), flat)
     whole = shapely.make_valid(flat)
-    reach = max(APART, SLACK + float(np.hypot(*lean)) * STEP)
+    reach = max(APART, hidden(lean))
     pairs = shapely.STRtree(whole).query(whole, predicate="dwithin", distance=reach).T
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     if footprint is not None:
@@ -69,6 +69,11 @@ def buildings(
     result = np.empty(len(ids), np.int64)
     result[order] = smallest[group]
     return result
+
+
+def hidden(lean: tuple[float, float]) -> float:
+    """Widest strip (m) of a building that its own steps can hide in an image of that lean."""
+    return SLACK + float(np.hypot(*lean)) * STEP
 
 
 def shared_edges(
@@ -126,8 +131,8 @@ def _facing(
     here, there = start[i] + middle[:, None] * u[i], start[j] + t[:, None] * span[j]
     step = np.abs(_heights(planes[of[i]], here) - _heights(planes[of[j]], there))
     normal = np.stack([u[i][:, 1], -u[i][:, 0]], axis=1)
-    hidden = SLACK + np.abs(normal @ np.asarray(lean, float)) * np.minimum(step, STEP)
-    near = np.abs(((there - here) * normal).sum(axis=1)) <= np.maximum(APART, hidden)
+    reach = SLACK + np.abs(normal @ np.asarray(lean, float)) * np.minimum(step, STEP)
+    near = np.abs(((there - here) * normal).sum(axis=1)) <= np.maximum(APART, reach)
     return np.where(near, along, 0.0), step
 
 

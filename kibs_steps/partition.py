@@ -27,6 +27,9 @@ from kibs_steps.errors import KibsError
 
 MM = 1000
 EXACT = 0.005  # m, sections that fit better than this are left alone
+REACH = 1.0  # m, vertices and edges that neighbours mean to share may be this far apart
+GAP = 1.5  # m
+NOISE = 0.35  # m, shortest edge worth keeping where sections do not fit
 STEP = 0.6  # m, roofs this far apart in height are taken for two levels
 SMALLEST = 0.5  # m², faces smaller than this are given to a neighbour
 CLEARANCE = 0.02  # m, a vertex this near to an edge is made part of it
@@ -51,25 +54,24 @@ def partition(
     polygons: Sequence[shapely.Geometry],
     planes: np.ndarray,
     reliable: np.ndarray,
-    tolerance: float = 1.0,
-    noise: float = 0.35,
+    gap: float = GAP,
 ) -> list[Face]:
     """The faces of a building.
 
     `polygons`: n polygons (m, any validity); `planes`: (n, 3) coefficients of z = a·x + b·y + c in the same frame;
-    `reliable`: (n,) bool, whose height can be trusted; `tolerance` (m): widest gap or overlap between neighbours;
-    `noise` (m): shortest edge worth keeping where sections do not fit. Raises `NoPartition`.
+    `reliable`: (n,) bool, whose height can be trusted; `gap` (m): widest gap between neighbours that do not fit.
+    Raises `NoPartition`.
     """
     cleaned = [polygonal(p) for p in polygons]
     if all(p.is_empty for p in cleaned):
         raise NoPartition("no section has an area")
-    for reach in (EXACT, tolerance):
-        faces, fits = _tile(cleaned, planes, reliable, reach, 1.5 * tolerance)
+    for reach, narrow in ((EXACT, REACH), (REACH, gap)):
+        faces, fits = _tile(cleaned, planes, reliable, reach, narrow)
         if not faces:
             raise NoPartition("no section is wide enough to stand")
         if fits:
             return straightened(_clear(_contracted(faces, 2 * EXACT)), STRAIGHT)
-    return _clear(_regular(faces, noise))
+    return _clear(_regular(faces, NOISE))
 
 
 def polygonal(geometry: shapely.Geometry | None) -> shapely.Geometry:
@@ -196,11 +198,11 @@ def _components(n: int, neighbours: dict[int, set[int]]) -> list[int]:
 
 
 def _tile(
-    polygons: list[shapely.Geometry], planes: np.ndarray, reliable: np.ndarray, reach: float, tolerance: float
+    polygons: list[shapely.Geometry], planes: np.ndarray, reliable: np.ndarray, reach: float, gap: float
 ) -> tuple[list[Face], bool]:
-    """Faces from sections whose vertices are brought together within `reach`; whether no misfit below `tolerance` was left."""
+    """Faces from sections whose vertices are brought together within `reach`; whether nothing narrower than `gap` misfitted."""
     together = [polygonal(p) for p in _snapped(polygons, planes, reliable, reach)]
-    slits = _slits(together, tolerance)
+    slits = _slits(together, gap)
     lines = shapely.unary_union(shapely.boundary([*together, *slits]), grid_size=1 / MM)
     cells = shapely.get_parts(shapely.polygonize(shapely.get_parts(lines)))
     if not len(cells):
@@ -215,7 +217,7 @@ def _tile(
     in_slit = np.zeros(len(cells), bool)
     if len(slits):
         in_slit[shapely.STRtree(slits).query(inner, predicate="within")[0]] = True
-    narrow = shapely.is_empty(shapely.buffer(cells, -tolerance / 2, quad_segs=1)) & (shapely.area(cells) > 1e-12)
+    narrow = shapely.is_empty(shapely.buffer(cells, -gap / 2, quad_segs=1)) & (shapely.area(cells) > 1e-12)
     size = shapely.area(together)
 
     def heights(k: int) -> dict[int, float]:

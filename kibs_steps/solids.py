@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +19,10 @@ import pyarrow as pa
 import shapely
 
 from kibs_steps import cli, gate, scene, shells, store
+from kibs_steps.buildings import hidden
 from kibs_steps.errors import KibsError
 from kibs_steps.ground import slope_azimuth
-from kibs_steps.partition import MM, Face, NoPartition, dissolved, partition, polygon, polygonal
+from kibs_steps.partition import GAP, MM, Face, NoPartition, dissolved, partition, polygon, polygonal
 from kibs_steps.planes_together import SLOPE_CAP, bring_together
 from kibs_steps.shells import GROUND, ROOF, WALL, Surface
 from kibs_steps.terrain import Terrain
@@ -84,11 +86,11 @@ class Solid(NamedTuple):
     base: shapely.Geometry
 
 
-def build(sections: Sections, dtm: Terrain, lod_label: str = "2.0") -> Solid:
-    """The most detailed valid solid of a building; never raises on geometry."""
+def build(sections: Sections, dtm: Terrain, lod_label: str = "2.0", gap: float = GAP) -> Solid:
+    """The most detailed valid solid of a building; never raises on geometry. `gap` (m) as in `partition`."""
     refused: list[str] = []
     try:
-        faces, planes = partition(sections.polygons, sections.planes, sections.fitted), sections.planes
+        faces, planes = partition(sections.polygons, sections.planes, sections.fitted, gap), sections.planes
     except CANNOT as error:
         refused.append(f"{lod_label} and 1.3: {error}")
         try:
@@ -278,8 +280,8 @@ def sections_of(table: pa.Table) -> Iterator[tuple[int, Sections]]:
     a, b, c, x0, y0, sigma = (
         table[name].to_numpy().astype(float) for name in ("plane_a", "plane_b", "plane_c", "x0", "y0", "height_sigma")
     )
-    firsts = np.flatnonzero(np.r_[True, np.diff(building) != 0]) if len(building) else np.zeros(0, int)
-    for first, end in zip(firsts, [*firsts[1:], len(building)], strict=True):
+    cuts = [0, *(np.flatnonzero(np.diff(building)) + 1), len(building)]
+    for first, end in pairwise(cuts if len(building) else []):
         mine = slice(first, end)
         corner = shapely.get_coordinates(outlines[mine])
         corner = corner[np.isfinite(corner).all(axis=1)]
@@ -308,7 +310,7 @@ def attributes(building: int, sections: Sections, solid: Solid, position_correct
         "eave_z": eave,
         "ridge_z": ridge,
         "height": None if ridge is None else round(ridge - ground, 3),
-        "volume": round(sum(gate.volume([s.rings for s in shell]) for shell in solid.shells) / MM**3, 3),
+        "volume": round(float(sum(gate.volume([s.rings for s in shell]) for shell in solid.shells)) / MM**3, 3),
         "footprint_area": round(float(shapely.area(solid.base)), 3),
         "roof_type": solid.roof_type,
         "outline": shapely.MultiPolygon(parts),
@@ -411,11 +413,12 @@ def main(argv: list[str] | None = None) -> None:
     buildings = list(sections_of(store.read_table(args.buildings, block=args.name)))
     shapes = [_moved(p, s.origin) for _, s in buildings for p in s.polygons if p is not None and not p.is_empty]
     dtm = facts.terrain(tuple(shapely.total_bounds(shapes)) if shapes else grid.bounds)
+    gap = max(GAP, hidden(facts.lean))
     rows = []
     with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
         out.write(json.dumps(header(datum), separators=(",", ":")) + "\n")
         for building, sections in buildings:
-            solid = build(sections, dtm, args.lod_label)
+            solid = build(sections, dtm, args.lod_label, gap)
             row = attributes(building, sections, solid, facts.view is not None)
             line = feature(row, sections, solid, datum, convergence)
             out.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")

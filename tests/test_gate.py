@@ -125,8 +125,7 @@ def test_an_edge_through_a_face_is_refused():
     low, high = [(*p, 0) for p in ring], [(*p, 4000) for p in ring]
     roof = [[[high[k - 1], high[k], tip]] for k in range(4)]
     walls = [[[low[k - 1], low[k], high[k], high[k - 1]]] for k in range(4)]
-    found = kinds([*roof, *walls, [low[::-1]]])
-    assert found & {"intersection", "inside_out"}
+    assert "intersection" in kinds([*roof, *walls, [low[::-1]]])
 
 
 def test_a_vertex_that_touches_a_foreign_face_is_refused():
