@@ -410,7 +410,7 @@ class Mixture:
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng([self.seed, index])
         if self._listed_at < 0 or index - self._listed_at > 500:
-            self._kept = sorted(self.pool.glob("*.npz"))
+            self._kept = sorted(self.pool.glob("[!.]*.npz"))
             self._listed_at = index
         shares = np.array(self.shares) * [bool(self._kept), bool(self.graphs), bool(self.chips)]
         source = rng.choice(3, p=shares / shares.sum())

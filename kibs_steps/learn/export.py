@@ -73,7 +73,7 @@ def contract_of(task: str, heights: tuple[float, float] | None = None, **facts: 
 
 def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float]:
     """Mean and standard deviation (m) of the corners' heights in the first kept tiles of a pool."""
-    heights = [dataset.load(path).corner_heights for path in sorted(pool.glob("*.npz"))[:most]]
+    heights = [dataset.load(path).corner_heights for path in sorted(pool.glob("[!.]*.npz"))[:most]]
     known = np.concatenate(heights)
     known = known[np.isfinite(known)]
     return float(known.mean()), float(known.std())

@@ -208,7 +208,7 @@ def train(
     settings: Settings,
     out: Path,
     seconds: float,
-    save_every: float = 180.0,
+    save_every: float = 60.0,
     steps: int | None = None,
     workers: int = 1,
 ) -> int:
@@ -278,7 +278,7 @@ def train(
 
 def fill_pool(pool: Path, count: int, seed: int, chips: list[dataset.Chip]) -> None:
     """Render simulated tiles into a folder until it holds `count`, leaving what is there."""
-    os.nice(5)
+    os.nice(10)
     cv2.setNumThreads(1)
     backgrounds = [(chip.rgb, ~chip.building) for chip in chips]
     pool.mkdir(parents=True, exist_ok=True)

@@ -7,12 +7,14 @@ Out: a report by test set, and pictures to look at. Decoding is the product's ow
 from __future__ import annotations
 
 import argparse
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import rasterio
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -96,7 +98,7 @@ def village(folder: str | Path, size: int) -> list[dataset.Sample]:
     samples = []
     for path in sorted(Path(folder).glob("*_labels.png")):
         image = next(p for p in Path(folder).glob(path.name.replace("_labels.png", "_rgb.*")))
-        rgb = cv2.imread(str(image), cv2.IMREAD_COLOR)[..., ::-1]
+        rgb = _photograph(image)
         marked = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         orientation, roof = (marked, marked > 0) if marked.ndim == 2 else (marked[..., 1], marked[..., 2] > 0)
         side = round(rgb.shape[0] * 0.1 / dataset.GSD)
@@ -120,6 +122,14 @@ def village(folder: str | Path, size: int) -> list[dataset.Sample]:
             )
         )
     return samples
+
+
+def _photograph(path: Path) -> np.ndarray:
+    """The first three bands of a PNG or TIFF, (h, w, 3)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        with rasterio.open(path) as file:
+            return np.ascontiguousarray(file.read([1, 2, 3]).transpose(1, 2, 0))
 
 
 def simulated(count: int, size: int, view_elevation: tuple[float, float]) -> list[dataset.Sample]:

@@ -1,7 +1,9 @@
 """Tiles: readers on tiny data sets, and transforms that must keep image and truth together."""
 
 import io
+import os
 import tarfile
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -135,3 +137,15 @@ def test_kept_samples_come_back(marked, tmp_path):
     back = dataset.load(tmp_path / "a.npz")
     for one, other in zip(marked, back, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+data = pytest.mark.skipif("KIBS_DATA" not in os.environ, reason="needs real data: set KIBS_DATA")
+
+
+@data
+def test_real_chips_have_masks_of_their_size():
+    chips = dataset.read_chips(Path(os.environ["KIBS_DATA"]) / "chips")
+    assert len(chips) > 20
+    for chip in chips:
+        assert chip.rgb.shape == (*chip.building.shape, 3)
+        assert 0 < chip.building.mean() < 0.8

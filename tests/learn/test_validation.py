@@ -1,5 +1,8 @@
 """Measures against cases counted by hand."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -40,3 +43,15 @@ def test_roof_iou_leaves_unknown_out():
     truth = np.array([[1, 1, 0, 255]], np.uint8)
     found = np.array([[True, False, True, True]])
     assert validation.roof_iou([(found, truth)]) == pytest.approx(1 / 3)
+
+
+@pytest.mark.skipif("KIBS_DATA" not in os.environ, reason="needs real data: set KIBS_DATA")
+def test_village_scenes_are_judged_only_where_they_are_annotated():
+    scenes = validation.village(Path(os.environ["KIBS_DATA"]) / "village", 256)
+    assert len(scenes) == 11
+    for scene in scenes:
+        assert scene.rgb.shape == (256, 256, 3)
+        judged = scene.roof != validation.dataset.UNKNOWN
+        assert judged.sum() == round(51.2 / 0.38) ** 2
+        assert (scene.labels[~judged] == -1).all()
+        assert ((scene.labels != 0) == (scene.roof == 1))[judged].all()
