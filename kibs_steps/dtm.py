@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 AROUND = 250.0  # metres of terrain around the scene, and how far a hole's pixels may be from data
 HIGHEST = 9000.0
-STRIP = 1024
+STRIP = 512
 REACH = 64  # pixels over which a strip's own neighbours fill a hole; what is farther is filled from a coarse copy
 COARSE = 1024
 METRES = {
@@ -123,10 +123,11 @@ def _canvas(source: rasterio.DatasetReader, grid: Grid):
     factor, scale, offset = metres_per_unit(source), source.scales[0], source.offsets[0]
 
     def heights(dataset: rasterio.DatasetReader, window: Window) -> np.ndarray:
-        raw = dataset.read(1, window=window)
-        valid = dataset.read_masks(1, window=window) > 0
-        values = (raw * np.float64(scale) + offset) * factor
-        return np.where(valid & np.isfinite(values), values, np.nan).astype(np.float32)
+        values = dataset.read(1, window=window, out_dtype="float32")
+        if (factor, scale, offset) != (1.0, 1.0, 0.0):
+            values = ((values * np.float64(scale) + offset) * factor).astype(np.float32)
+        values[(dataset.read_masks(1, window=window) == 0) | ~np.isfinite(values)] = np.nan
+        return values
 
     own = imagery.crs_name(imagery.crs_of(source)) == grid.crs and t.b == 0 and t.d == 0 and t.a > 0 and t.e < 0
     if own:
@@ -222,8 +223,8 @@ def _survey(canvas: Canvas, area, name: str) -> tuple[np.ndarray, float]:
                 f"(gdal_edit.py -a_nodata {absurd[0]:g}); if heights are not in metres, convert them"
             )
         kept = slice(-top % every, None, every)
-        coarse.append(heights[kept, ::every])
-        within.append(inside[kept, ::every])
+        coarse.append(heights[kept, ::every].copy())
+        within.append(inside[kept, ::every].copy())
     heights, inside = np.concatenate(coarse), np.concatenate(within)
     hole = np.isnan(heights)
     if hole.all():

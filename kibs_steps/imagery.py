@@ -1,8 +1,8 @@
 """Imagery: what a raster file says of itself, before any model sees it.
 
 Its horizontal CRS and pixel size in metres, which bands are red, green and blue, which pixels hold data, and the
-**stretch** that brings its values to 8 bit. Everything is read from the header or from one decimated read, so the cost
-does not grow with the raster. Out: values for `scene.json`.
+**stretch** that brings its values to 8 bit. Everything is read from the header or from a sample, so the cost does not
+grow with the raster. Out: values for `scene.json`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 STRETCH_PERCENTILES = (1.0, 99.0)
 STRETCH_GAMMA = 0.6
 SAMPLE_PIXELS = 4_000_000
+LATTICE = 32
+CACHE = 256 * 2**20  # bytes that GDAL keeps of rasters; its default is a share of the machine's memory
 
 
 class RasterMissing(KibsError):
@@ -64,7 +66,7 @@ def opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
             raise NotARaster(
                 f"{path} cannot be read as a raster ({error}): give a GeoTIFF or another GDAL format"
             ) from error
-    with source:
+    with source, rasterio.Env(GDAL_CACHEMAX=CACHE):
         if not source.count:
             raise NotARaster(f"{path} holds no image of its own: name one of its subdatasets, {source.subdatasets[:3]}")
         yield source
@@ -203,11 +205,28 @@ def read(
 def sample(
     source: rasterio.DatasetReader, bands: tuple[int, ...], nodata: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `read`, the whole raster decimated to at most 4 million pixels; raises `NoData` if none of them holds any."""
-    step = max(1.0, np.sqrt(source.width * source.height / SAMPLE_PIXELS))
-    values, valid = read(
-        source, bands, nodata, out_shape=(max(1, int(source.height / step)), max(1, int(source.width / step)))
-    )
+    """As `read`, for statistics: all of a raster of up to 4 million pixels, of a larger one as many, in a lattice of windows.
+
+    Raises `NoData` if not one pixel of the raster holds data.
+    """
+    from rasterio.windows import Window
+
+    side = int(np.sqrt(SAMPLE_PIXELS)) // LATTICE
+    if source.width * source.height <= SAMPLE_PIXELS:
+        values, valid = read(source, bands, nodata)
+    else:
+        width, height = min(side, source.width), min(side, source.height)
+        windows = [
+            read(source, bands, nodata, window=Window(int(col), int(row), width, height))
+            for row in np.linspace(0, source.height - height, LATTICE)
+            for col in np.linspace(0, source.width - width, LATTICE)
+        ]
+        values = np.concatenate([values for values, _ in windows], axis=1)
+        valid = np.concatenate([valid for _, valid in windows])
+        if not valid.any():
+            step = np.sqrt(source.width * source.height / SAMPLE_PIXELS)
+            shape = (int(np.ceil(source.height / step)), int(np.ceil(source.width / step)))
+            values, valid = read(source, bands, nodata, out_shape=shape)
     if not valid.any():
         raise NoData(f"{source.name} holds no data: every pixel is nodata or masked")
     return values, valid

@@ -250,6 +250,19 @@ class TestRadiometry:
         assert content["coverage"] == 1.0
         assert "33 %" in content["warnings"][0]
 
+    def test_a_large_raster_is_sampled(self, tmp_path):
+        """Of 9 million pixels, 4 million tell the same; data in one corner only is found all the same."""
+        values = np.random.default_rng(0).integers(100, 2000, (1, 3000, 3000)).astype("uint16")
+        values[:, :1500] = 0
+        path = rasters.write(tmp_path / "a.tif", values)
+        made, content = build(tmp_path, path, bands=(1, 1, 1))
+        assert content["coverage"] == pytest.approx(0.5, abs=0.01)
+        assert made.stretch[0][:2] == pytest.approx((119, 1981), abs=3)
+        values[:] = 0
+        values[:, 70:90, 70:90] = 500
+        made, content = build(tmp_path, rasters.write(tmp_path / "b.tif", values), bands=(1, 1, 1))
+        assert 0 < content["coverage"] < 1e-3
+
     def test_a_constant_band_does_not_divide_by_zero(self, tmp_path):
         made, _ = build(tmp_path, rasters.write(tmp_path / "a.tif", np.full((3, 9, 9), 500, "uint16")))
         assert (imagery.stretched(np.full((3, 9, 9), 500, "uint16"), made.stretch) == 1).all()
