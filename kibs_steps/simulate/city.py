@@ -16,16 +16,24 @@ from kibs_steps.simulate.surfaces import palette
 from kibs_steps.terrain import Terrain
 
 STYLES = ("suburb", "rows", "village", "perimeter", "centre", "industry", "farm", "desert", "estate")
-BLOCKS = {  # block length and depth, road width (m)
-    "suburb": (80, 170, 46, 78, 5, 9), "rows": (70, 150, 38, 80, 5, 10), "village": (50, 130, 40, 90, 3.5, 7),
-    "perimeter": (55, 130, 45, 90, 8, 18), "centre": (50, 110, 45, 90, 8, 20), "industry": (70, 180, 60, 130, 7, 14),
-    "farm": (90, 220, 80, 200, 3, 5), "desert": (50, 110, 30, 60, 4, 10), "estate": (90, 200, 70, 130, 6, 12), "mixed": (60, 130, 50, 90, 5, 14),
-}  # fmt: skip
-NATIVE = {
-    "suburb": None, "rows": ("holland", "britain", "north_france", "germany"), "village": ("north_france", "germany", "mediterranean", "scandinavia"),
-    "perimeter": ("paris", "germany", "mediterranean", "north_france", "scandinavia", "holland"), "centre": None, "industry": None, "farm": None,
-    "desert": ("desert", "desert", "mediterranean"), "estate": None, "mixed": None,
-}  # fmt: skip
+BLOCKS = {  # block length and depth, road width: least and most (m)
+    "suburb": (80, 170, 46, 78, 5, 9),
+    "rows": (70, 150, 38, 80, 5, 10),
+    "village": (50, 130, 40, 90, 3.5, 7),
+    "perimeter": (55, 130, 45, 90, 8, 18),
+    "centre": (50, 110, 45, 90, 8, 20),
+    "industry": (70, 180, 60, 130, 7, 14),
+    "farm": (90, 220, 80, 200, 3, 5),
+    "desert": (50, 110, 30, 60, 4, 10),
+    "estate": (90, 200, 70, 130, 6, 12),
+    "mixed": (60, 130, 50, 90, 5, 14),
+}
+NATIVE = {  # where a style is at home; elsewhere now and then
+    "rows": ("holland", "britain", "north_france", "germany"),
+    "village": ("north_france", "germany", "mediterranean", "scandinavia"),
+    "perimeter": ("paris", "germany", "mediterranean", "north_france", "scandinavia", "holland"),
+    "desert": ("desert", "desert", "mediterranean"),
+}
 
 
 def procedural(
@@ -38,8 +46,8 @@ def procedural(
 ) -> City:
     """A city of one of `STYLES` (or "mixed") over `width`×`height` m whose lower-left corner is `origin` (map metres)."""
     area = (origin[0], origin[1], origin[0] + width, origin[1] + height)
-    native = NATIVE[style]
-    country = str(rng.choice(native)) if native and rng.random() < 0.75 else None
+    native = NATIVE.get(style)
+    country = pick(rng, native) if native and rng.random() < 0.75 else None
     kit = palette(rng, country)
     curved = rng.random() < {"suburb": 0.6, "village": 0.8, "farm": 0.5}.get(style, 0.25)
     site = Site(rng, terrain, kit, area, float(curved))

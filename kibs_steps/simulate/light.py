@@ -44,8 +44,8 @@ class Light(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def noise() -> tuple[np.ndarray, np.ndarray]:
-    """Two tileable fields (SIDE, SIDE), mean 0, deviation 1: patches (all scales) and clumps (about a metre)."""
+def noise() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean 0, deviation 1: two tileable fields (SIDE, SIDE), patches of all scales and clumps of about a metre; grain (n,)."""
     rng = np.random.default_rng(7)
     fy, fx = np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None]
     f = np.hypot(fx, fy)
@@ -55,7 +55,7 @@ def noise() -> tuple[np.ndarray, np.ndarray]:
         white = np.fft.rfft2(rng.normal(size=(SIDE, SIDE)))
         field = np.fft.irfft2(white * spectrum, (SIDE, SIDE))
         fields.append((field / field.std()).astype(np.float32))
-    return fields[0], fields[1]
+    return fields[0], fields[1], rng.standard_normal(1 << 20, np.float32)
 
 
 def light(sun_lean: tuple[float, float], rng: np.random.Generator) -> Light:
@@ -120,44 +120,47 @@ def albedo(
     index: np.ndarray, points: np.ndarray, table: Surfaces, materials: list[Material], rng: np.random.Generator
 ) -> np.ndarray:
     """Albedo (n, 3) float32 of samples of surfaces `index` (n,) at `points` (n, 3) float32 m."""
-    patches, clumps = noise()
-    away = points - table.origin[index]
-    u = np.einsum("ij,ij->i", away, table.u[index])
-    v = np.einsum("ij,ij->i", away, table.v[index])
-    kind = table.material[index]
-    shift = table.shift[index]
+    patches, clumps, white = noise()
+    x, y, z = points.T
+
+    def along(axis: np.ndarray) -> np.ndarray:
+        start = np.einsum("ij,ij->i", table.origin, axis)
+        parts = (np.take(np.ascontiguousarray(axis[:, i]), index) for i in range(3))
+        return sum(p * q for p, q in zip(parts, (x, y, z), strict=True)) - np.take(start, index)
+
+    u, v = along(table.u), along(table.v)
+    kind = np.take(table.material, index)
+    shift = np.take(table.shift, index, axis=0)
     columns = {name: np.array([getattr(m, name) for m in materials], np.float32) for name in Material._fields[1:]}
 
     def of(name: str) -> np.ndarray:
-        return columns[name][kind]
+        return np.take(columns[name], kind)
 
-    def look(field: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def look(field: np.ndarray, a: np.ndarray, b: np.ndarray, shift: np.ndarray) -> np.ndarray:
         col, row = (a + shift[:, 0]).astype(np.int32) & (SIDE - 1), (b + shift[:, 1]).astype(np.int32) & (SIDE - 1)
-        return field.ravel()[row * SIDE + col]
+        return np.take(field.ravel(), row * SIDE + col)
 
-    change = of("mottle") * look(patches, 4 * u, 4 * v)
-    change += of("grain") * rng.standard_normal(len(u), np.float32)
-    change += of("leaf") * look(clumps, 2.5 * u, 2.5 * v)
+    change = of("mottle") * look(patches, 4 * u, 4 * v, shift)
+    start = int(rng.integers(len(white)))
+    change += of("grain") * np.take(white, np.arange(start, start + len(u)), mode="wrap")
+    change += of("leaf") * look(clumps, 2.5 * u, 2.5 * v, shift)
     some = np.flatnonzero(of("streak") > 0)
     if len(some):
-        shift_, shift = shift, shift[some]
-        change[some] += of("streak")[some] * look(patches, 5 * u[some], 0.35 * v[some])
-        shift = shift_
-    for period, depth, along in (("course", "course_depth", v), ("seam", "seam_depth", u)):
+        change[some] += of("streak")[some] * look(patches, 5 * u[some], 0.35 * v[some], shift[some])
+    for period, depth, place in (("course", "course_depth", v), ("seam", "seam_depth", u)):
         some = np.flatnonzero(of(period) > 0)
-        phase = along[some] / of(period)[some]
+        phase = place[some] / of(period)[some]
         change[some] -= of(depth)[some] * ((phase - np.floor(phase)) < 0.3)
-    colour = table.colour[index] * np.clip(1 + change, 0.15, 2.5)[:, None]
-    some = np.flatnonzero(table.upright[index] & (of("storey") > 0))
+    colour = np.take(table.colour, index, axis=0) * np.clip(1 + change, 0.15, 2.5)[:, None]
+    some = np.flatnonzero(np.take(table.upright, index) & (of("storey") > 0))
     if len(some):
-        columns_of = materials_of = kind[some]
-        storey, bay, glass = (columns[c][columns_of] for c in ("storey", "bay", "glass"))
+        storey, bay, glass = (columns[c][kind[some]] for c in ("storey", "bay", "glass"))
         # Windows from the top down, so that no storey is cut at the eave.
         down = (table.length[index[some]] - v[some]) / storey
         across = u[some] / bay
         fu, fv = across - np.floor(across), down - np.floor(down)
         window = (np.abs(fu - 0.5) < glass / 2) & (fv > 0.22) & (fv < 0.72) & (v[some] > 0.8)
-        pane = (np.floor(across) * 7.13 + np.floor(down) * 3.71 + materials_of + table.shift[index[some], 0]) % 1.0
+        pane = (np.floor(across) * 7.13 + np.floor(down) * 3.71 + kind[some] + table.shift[index[some], 0]) % 1.0
         colour[some[window]] = np.array([0.05, 0.06, 0.075], np.float32) * (0.5 + 3.0 * pane[window, None] ** 3)
     return colour
 

@@ -248,7 +248,7 @@ def _set_back(edges: list[tuple[np.ndarray, np.ndarray]], overhang: float) -> li
 
 
 class Frame(NamedTuple):
-    """A section's own axes: `origin` on its eave, `along` the eave (unit, horizontal), `up` the slope (horizontal), `rise` m/m."""
+    """A section's own axes: `origin` on its eave, `along` the eave and `up` the slope (horizontal units), `rise` m/m."""
 
     origin: np.ndarray
     along: np.ndarray

@@ -90,8 +90,9 @@ class _Seen(NamedTuple):
 
 def _see(city: City, terrain: Terrain, samples: Grid, k: tuple[float, float]) -> _Seen:
     faces = city.faces
-    rows, cols = np.mgrid[: samples.height, : samples.width]
-    x_y = samples.to_map(np.stack([cols + 0.5, rows + 0.5], -1))
+    x_y = np.empty((samples.height, samples.width, 2))
+    x_y[..., 0] = samples.x0 + (np.arange(samples.width) + 0.5) * samples.gsd
+    x_y[..., 1] = samples.y0 - (np.arange(samples.height)[:, None] + 0.5) * samples.gsd
     level = np.ptp(terrain.heights) == 0
     base = float(terrain.heights.flat[0]) if level else float(np.mean(terrain.heights))
     ground = np.full(x_y.shape[:2], base) if level else terrain(x_y)
@@ -107,8 +108,10 @@ def _see(city: City, terrain: Terrain, samples: Grid, k: tuple[float, float]) ->
             face = face[at[..., 1], at[..., 0]]
         found = face >= 0
         index = np.where(found, chosen[face] if len(chosen) else -1, -1)
-        z = np.full(face.shape, -np.inf)
-        z[found] = zbuffer.heights_on(planes, index[found], through[found], k, base)
+        z = hits.height
+        if not level:
+            z = np.full(face.shape, -np.inf)
+            z[found] = zbuffer.heights_on(planes, index[found], through[found], k, base)
         buried = z <= ground
         index[buried], z[buried] = -1, -np.inf
         return index, z
@@ -228,8 +231,8 @@ def _shine(
             colour[chosen] = photograph[0][rows].reshape(-1, 3)[chosen]
         light_here = light.radiance(
             colour * rims[rows].reshape(-1, 1),
-            table.normal[which],
-            table.leafy[which],
+            np.take(table.normal, which, axis=0),
+            np.take(table.leafy, which),
             lit[rows].ravel(),
             sky[rows].ravel(),
             source,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
 import cv2
@@ -80,6 +81,37 @@ class Place(NamedTuple):
         return out
 
 
+@lru_cache(maxsize=16)
+def crowns(count: int) -> list[np.ndarray]:
+    """A dozen crowns of `count` tilted leafy discs (count, 8, 3), radius 1, from −1 to 1 high; 0: conifers."""
+    rng = np.random.default_rng(count)
+    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    made = []
+    for _ in range(12):
+        if count:
+            direction = rng.normal(size=(count, 3))
+            direction[:, 2] = np.abs(direction[:, 2]) - 0.2
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            direction[0] = (0, 0, -0.3)  # a wide one below closes the crown
+            centre = direction * [0.62, 0.62, 0.8]
+            size = rng.uniform(0.38, 0.62, count)
+            size[0] = 0.85
+            normal = direction * [0.8, 0.8, 1.0] + [0, 0, 0.55]
+        else:
+            share = np.array([0.0, 0.3, 0.58, 0.85])
+            centre = np.column_stack([0 * share, 0 * share, share])
+            size = 1 - 0.85 * share
+            normal = rng.normal(0, 0.15, (4, 3)) + np.array([0, 0, 1])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        side = np.cross(normal, [0.0, 1.0, 0.0])
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        other = np.cross(normal, side)
+        reach = size[:, None, None] * rng.uniform(0.75, 1.15, (len(size), 8, 1))
+        spokes = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * other[:, None]
+        made.append(centre[:, None] + reach * spokes)
+    return made
+
+
 class Site:
     """A city being built: everything added goes through here, so that numbers and materials stay consistent."""
 
@@ -134,11 +166,16 @@ class Site:
 
     def grounded(self, place: Place, ring: np.ndarray) -> Place:
         """The place with its base at the lowest terrain under a footprint (n, ≥ 2, own frame)."""
+        return place._replace(base=self._ground_under(place, ring)[0])
+
+    def _ground_under(self, place: Place, ring: np.ndarray) -> tuple[float, float]:
+        """Lowest and highest terrain under a footprint."""
         if self.level:
-            return place._replace(base=self.ground)
+            return self.ground, self.ground
         x_y = place.put(np.asarray(ring, float)[:, :2])
         x_y = np.concatenate([x_y, (x_y + np.roll(x_y, -1, axis=0)) / 2, x_y.mean(0, keepdims=True)])
-        return place._replace(base=float(self.terrain(x_y).min()))
+        z = self.terrain(x_y)
+        return float(z.min()), float(z.max())
 
     def tint(self, amount: float = 0.05) -> tuple[float, float, float]:
         """A random brightness with a little colour."""
@@ -219,7 +256,12 @@ class Site:
             return 0
         self.occupy(place, footprints)
         rings = roofs.sections(wings)
-        place = self.grounded(place, np.concatenate(rings))
+        low, high = self._ground_under(place, np.concatenate(rings))
+        place = place._replace(base=low)
+        # On a slope the eaves stay clear of the ground uphill.
+        clear = high - low + 1.8 - min(float(ring[:, 2].min()) for ring in rings)
+        if not self.level and clear > 0:
+            rings = [ring + np.array([0.0, 0.0, clear]) for ring in rings]
         if number is None:
             self.buildings += 1
             number = self.buildings
@@ -421,34 +463,13 @@ class Site:
             return
         z0 = self.ground if self.level else float(self.terrain(np.array([[x, y]]))[0])
         material = self.kit.draw(rng, use)
-        if conifer:
-            share = np.array([0.0, 0.3, 0.58, 0.85])
-            centre = np.column_stack([np.zeros(4), np.zeros(4), height * (0.25 + 0.75 * share)])
-            size = radius * (1 - 0.85 * share)
-            normal = rng.normal(0, 0.15, (4, 3)) + np.array([0, 0, 1])
-        else:
-            n = int(np.clip(4 + radius * 2.2, 4, 14))
-            direction = rng.normal(size=(n, 3))
-            direction[:, 2] = np.abs(direction[:, 2]) - 0.2
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            direction[0] = (0, 0, -0.3)
-            deep = min(0.45 * height, radius)
-            centre = direction * [0.62 * radius, 0.62 * radius, 0.8 * deep] + [0, 0, height - deep]
-            size = radius * rng.uniform(0.38, 0.62, n)
-            size[0] = 0.85 * radius
-            normal = direction * [0.8, 0.8, 1.0] + [0, 0, 0.55]
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        x_n, y_n, z_n = normal.T
-        side = np.column_stack([z_n, 0 * z_n, -x_n]) / np.hypot(z_n, x_n)[:, None]
-        x_s, _, z_s = side.T
-        other = np.column_stack([y_n * z_s, z_n * x_s - x_n * z_s, -y_n * x_s])
-        angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
-        reach = size[:, None] * rng.uniform(0.75, 1.15, (len(size), 8))
-        discs = centre[:, None] + reach[..., None] * (
-            np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * other[:, None]
-        )
-        discs += [x, y, z0]
-        bright = np.exp(rng.normal(0, 0.16, len(size))) * np.exp(rng.normal(0, 0.12))
+        discs = pick(rng, crowns(0 if conifer else min(4 + int(2 * radius), 13)))
+        # A conifer's crown reaches nearly down to the ground, others' are round.
+        deep = 0.8 * height if conifer else min(0.45 * height, radius)
+        turn = rng.uniform(0, 2 * np.pi)
+        c, r = radius * math.cos(turn), radius * math.sin(turn)
+        discs = discs @ np.array([[c, r, 0], [-r, c, 0], [0, 0, deep]]) + [x, y, z0 + height - deep]
+        bright = np.exp(rng.normal(0, 0.16, len(discs))) * np.exp(rng.normal(0, 0.12))
         self.faces += [
             Face(d, (), TREE, 0, 0, material, (b, b, b)) for d, b in zip(discs, bright.tolist(), strict=True)
         ]

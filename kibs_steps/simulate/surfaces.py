@@ -102,7 +102,7 @@ COUNTRIES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     ),
     "holland": (
         {"orange_tile": 4, "red_tile": 3, "dark_tile": 4, "brown_tile": 2, "grey_tile": 2},
-        {"bitumen": 4, "gravel": 2, "grey_felt": 3, "membrane": 1, "green_roof": 0.5},
+        {"bitumen": 4, "gravel": 2, "grey_felt": 3, "membrane": 1, "green_roof": 0.3},
     ),
     "germany": (
         {"red_tile": 5, "orange_tile": 2, "brown_tile": 3, "dark_tile": 3, "slate": 1.5, "grey_tile": 1},

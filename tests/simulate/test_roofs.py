@@ -16,9 +16,13 @@ def plan(ring):
 PLANS = {
     "L": [wing("hip", -8, -4, 8, 4, 5, 0.7), wing("hip", -8, -14, 0, 4, 5, 0.7, False)],
     "T": [wing("gable", -8, -4, 8, 4, 5, 0.7), wing("one_hip", -2, -11, 3, 0, 5, 0.7, False)],
-    "U": [wing("hip", -9, -4, 9, 4, 6, 0.5), wing("gable", -9, -10, -4, 0, 6, 0.5, False), wing("gable", 3, -10, 9, 0, 5, 0.5, False)],
+    "U": [
+        wing("hip", -9, -4, 9, 4, 6, 0.5),
+        wing("gable", -9, -10, -4, 0, 6, 0.5, False),
+        wing("gable", 3, -10, 9, 0, 5, 0.5, False),
+    ],
     "cross": [wing("gable", -8, -3, 8, 3, 5, 0.9), wing("gable", -2, -9, 3, 8, 5, 0.9, False)],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", PLANS)
@@ -55,8 +59,18 @@ def test_the_highest_wing_shows(name):
 
 
 @pytest.mark.parametrize(
-    ("kind", "count"), [("gable", 2), ("hip", 4), ("half_hip", 4), ("pyramid", 4), ("shed", 1), ("flat", 1), ("mansard", 5), ("gambrel", 4)]
-)  # fmt: skip
+    ("kind", "count"),
+    [
+        ("gable", 2),
+        ("hip", 4),
+        ("half_hip", 4),
+        ("pyramid", 4),
+        ("shed", 1),
+        ("flat", 1),
+        ("mansard", 5),
+        ("gambrel", 4),
+    ],
+)
 def test_kinds_have_their_sections(kind, count):
     rings = sections([wing(kind, -6, -4, 6, 4, 5, 0.7)])
     assert len(rings) == count
