@@ -1,4 +1,5 @@
 # KIBS: one off-nadir raster and a terrain model to a LOD2 city. Start with `snakemake --cores 2`; see README.md.
+import json
 from pathlib import Path
 
 import yaml
@@ -26,6 +27,18 @@ try:
     }
 except KibsError as error:
     raise WorkflowError(str(error)) from None
+
+
+onstart:
+    for line in sorted(
+        {
+            m.licence_line
+            for p in PLANS.values()
+            if p.settings["feed"] == "models"
+            for m in p.models.values()
+        }
+    ):
+        logger.info(line)
 
 
 wildcard_constraints:

@@ -40,7 +40,7 @@ PLANE_FIELDS += [("status", pa.string()), ("status_reason", pa.string())]
 
 
 class Points(NamedTuple):
-    """Corners where they are seen, col, row (px), and where they stand, x, y, z (map, m, absolute); height above ground, σ (m)."""
+    """Corners where they are seen, col, row (px), and where they stand, x, y, z (map, m); height above ground, σ (m)."""
 
     col: np.ndarray
     row: np.ndarray

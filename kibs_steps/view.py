@@ -66,9 +66,7 @@ def ground_position(
     return position, terrain(position) + height
 
 
-def image_position(
-    ground: np.ndarray, z: np.ndarray, k: tuple[float, float], projected_on: Surface
-) -> np.ndarray:
+def image_position(ground: np.ndarray, z: np.ndarray, k: tuple[float, float], projected_on: Surface) -> np.ndarray:
     """Where the image shows points standing at `ground` (n, 2) with absolute height `z` (n,): the inverse of the above."""
     ground = np.asarray(ground, float)
     k = np.asarray(k, float)

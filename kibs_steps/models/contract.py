@@ -50,6 +50,11 @@ class Model(NamedTuple):
     sha256: str
     contract: dict[str, Any]
 
+    @property
+    def licence_line(self) -> str:
+        """What a user should know before using the model's results."""
+        return f"{self.path}: licence {self.contract['trained_on']['licence']}"
+
 
 def validate(contract: Any, source: str) -> dict[str, Any]:
     """Return the contract if it fits the schema; otherwise raise `ContractMismatch` naming the field."""

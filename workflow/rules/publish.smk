@@ -18,6 +18,14 @@ def published(p):
     return [f"results/{p.name}/{f}" for f in names]
 
 
+def licensed(wildcards):
+    """The records of the models whose licence the results inherit: none when the truth is fed in their place."""
+    tasks = (
+        [] if plan(wildcards).settings["feed"] == "truth" else ["sections", "corners"]
+    )
+    return ancient([f"results/{wildcards.scene}/models/{task}.json" for task in tasks])
+
+
 rule geopackage:
     """city.gpkg: buildings, footprints, roof sections, corners, blocks."""
     input:
@@ -25,6 +33,7 @@ rule geopackage:
         sections=ancient("results/{scene}/buildings.parquet"),
         solids=blocks("solids.parquet"),
         corners=blocks("filed_corners.parquet"),
+        models=licensed,
     output:
         "results/{scene}/city.gpkg",
     log:
@@ -37,7 +46,8 @@ rule geopackage:
     shell:
         "python -m kibs_steps.publish.geopackage --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --sections {input.sections:q}"
-        " --solids {input.solids:q} --corners {input.corners:q} --out {output:q} > {log:q} 2>&1"
+        " --solids {input.solids:q} --corners {input.corners:q} --models {input.models:q}"
+        " --out {output:q} > {log:q} 2>&1"
 
 
 rule cityjson:
@@ -81,6 +91,7 @@ rule rasters:
         scene=ancient("results/{scene}/scene.json"),
         dtm=ancient("results/{scene}/dtm.tif"),
         sections=ancient("results/{scene}/buildings.parquet"),
+        models=licensed,
     output:
         labels="results/{scene}/labels.tif",
         heights="results/{scene}/heights.tif",
@@ -90,11 +101,9 @@ rule rasters:
         RUN
     params:
         signature=signature("buildings"),
-        tiling=lambda w: plan(w).tiling,
     shell:
-        "python -m kibs_steps.publish.rasters --scene {input.scene:q} --tile {params.tiling.tile}"
-        " --margin {params.tiling.margin} --block {params.tiling.block} --sections {input.sections:q}"
-        " --labels {output.labels:q} --heights {output.heights:q} > {log:q} 2>&1"
+        "python -m kibs_steps.publish.rasters --scene {input.scene:q} --sections {input.sections:q}"
+        " --models {input.models:q} --labels {output.labels:q} --heights {output.heights:q} > {log:q} 2>&1"
 
 
 rule preview:
@@ -113,4 +122,27 @@ rule preview:
         signature=signature("buildings"),
     shell:
         "python -m kibs_steps.publish.preview --scene {input.scene:q} --sections {input.sections:q}"
+        " --out {output:q} > {log:q} 2>&1"
+
+
+rule record:
+    """run.json: versions, hashes, models and their licences, counts."""
+    input:
+        scene=ancient("results/{scene}/scene.json"),
+        sources=lambda w: ancient([plan(w).raster, *plan(w).terrain_files]),
+        models=licensed,
+        sections=ancient("results/{scene}/buildings.parquet"),
+        solids=blocks("solids.parquet"),
+    output:
+        "results/{scene}/run.json",
+    log:
+        "results/{scene}/logs/record.log",
+    conda:
+        RUN
+    params:
+        signature=signature("run"),
+        settings=lambda w: json.dumps(plan(w).settings),
+    shell:
+        "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} --models {input.models:q}"
+        " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"
         " --out {output:q} > {log:q} 2>&1"
