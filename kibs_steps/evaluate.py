@@ -34,6 +34,7 @@ LEVEL = 3.0  # deg: below this slope a roof has no azimuth
 CORNER_RADIUS = 2.0  # px
 TALL = 1.0  # m: relative errors are taken above this height
 SIDE = 1024  # px: side of the windows
+CACHE = 64  # MB that GDAL may keep; its default grows with the machine
 CENTIMETRES = 10_000  # errors beyond ± 100 m fall into the last bin
 
 PAPER_TABLES = {
@@ -403,7 +404,7 @@ def read_through(scene: Scene, sections: Truth, labels: str, heights: str, fallb
     split_of = _lookup(sections.ids, sections.split, 2)
     pairs, corners = [], []
     found, everything = no_errors(n_groups), no_errors(n_groups)
-    with rasterio.open(labels) as label_file, rasterio.open(heights) as height_file:
+    with rasterio.Env(GDAL_CACHEMAX=CACHE), rasterio.open(labels) as label_file, rasterio.open(heights) as height_file:
         for file in (label_file, height_file):
             _check_grid(file, grid)
         for window in grid.windows(SIDE):
@@ -552,8 +553,7 @@ def matched_planes(over: Overlaps, sections: Truth, predicted: Predicted) -> dic
     place_p = _lookup(predicted.ids, np.arange(len(predicted.ids)), -1)(over.predicted[over.second[over.matched]])
     known = place_p >= 0
     place_t, place_p = place_t[known], place_p[known]
-    planes = [truth.plane_of(outline) for outline in sections.standing[place_t]]
-    true = np.array([(plane.a, plane.b) for plane in planes]).reshape(-1, 2)
+    true = truth.planes_of(sections.standing[place_t])[:, :2]
     found, status = predicted.gradient[place_p], predicted.status[place_p]
     usable = np.isfinite(found).all(axis=1)
     figures = {"all": plane_figures(true[usable], found[usable])}

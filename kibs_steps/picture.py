@@ -6,7 +6,7 @@ smooth lines. Pictures need Pillow alone, and the same content gives the same by
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -68,10 +68,12 @@ def directions(slope: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDAr
     return np.rint(np.array(rgb).reshape(-1, 3) * 255).astype(np.uint8)
 
 
-def rings(outline: shapely.Geometry, scale: float) -> Iterable[list[tuple[float, float]]]:
-    """The rings of an outline in picture pixels."""
-    for ring in shapely.get_rings(outline):
-        yield [tuple(point) for point in (shapely.get_coordinates(ring) * scale).tolist()]
+def rings(outlines: NDArray[np.object_], scale: float) -> list[list[list[float]]]:
+    """Per outline its rings, outer one first, as x, y, x, y, … in picture pixels."""
+    parts, owner = shapely.get_rings(outlines, return_index=True)
+    points, ring = shapely.get_coordinates(parts, return_index=True)
+    flat = [part.ravel().tolist() for part in np.split(points * scale, np.flatnonzero(np.diff(ring)) + 1)]
+    return [flat[start:end] for start, end in pairwise(np.searchsorted(owner, np.arange(len(outlines) + 1)))]
 
 
 def paint(
@@ -87,30 +89,32 @@ def paint(
     base = Image.fromarray(rgb).resize(size, Image.Resampling.BICUBIC)
     fill = base.copy()
     draw = ImageDraw.Draw(fill)
-    for outline, colour in zip(outlines, colours.tolist(), strict=True):
-        shell, *holes = rings(outline, scale * FINER)
+    shapes = list(zip(rings(outlines, scale * FINER), map(tuple, colours.tolist()), strict=True))
+    for (shell, *holes), colour in shapes if cover else ():
         if holes:
-            fill_around(fill, shell, holes, tuple(colour))
+            fill_around(fill, shell, holes, colour)
         else:
-            draw.polygon(shell, fill=tuple(colour))
+            draw.polygon(shell, fill=colour)
     picture = Image.blend(base, fill, cover)
     draw = ImageDraw.Draw(picture)
-    for outline, colour in zip(outlines, colours.tolist(), strict=True):
-        for ring in rings(outline, scale * FINER):
-            draw.line(ring, fill=tuple(colour), width=max(1, round(width * FINER)), joint="curve")
+    for parts, colour in shapes:
+        for ring in parts:
+            draw.line(ring, fill=colour, width=max(1, round(width * FINER)))
     return picture.resize((rgb.shape[1], rgb.shape[0]), Image.Resampling.BOX)
 
 
-def fill_around(picture: Image.Image, shell: list, holes: list[list], colour: tuple[int, int, int]) -> None:
+def fill_around(
+    picture: Image.Image, shell: list[float], holes: list[list[float]], colour: tuple[int, int, int]
+) -> None:
     """Fill a ring but for its holes."""
-    points = np.array(shell)
-    left, top = np.floor(points.min(axis=0)).astype(int)
-    right, bottom = np.ceil(points.max(axis=0)).astype(int) + 1
-    mask = Image.new("L", (int(right - left), int(bottom - top)))
+    points = np.array(shell).reshape(-1, 2)
+    low = np.floor(points.min(axis=0)).astype(int)
+    size = np.ceil(points.max(axis=0)).astype(int) + 1 - low
+    mask = Image.new("L", tuple(size.tolist()))
     draw = ImageDraw.Draw(mask)
     for ring, value in ((shell, 255), *((hole, 0) for hole in holes)):
-        draw.polygon([(x - left, y - top) for x, y in ring], fill=value)
-    picture.paste(colour, (int(left), int(top)), mask)
+        draw.polygon((np.array(ring).reshape(-1, 2) - low).ravel().tolist(), fill=value)
+    picture.paste(colour, tuple(low.tolist()), mask)
 
 
 def font(size: int) -> ImageFont.FreeTypeFont:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -276,16 +277,28 @@ def _per_polygon(polygons: NDArray[np.object_]) -> tuple[NDArray[np.float64], ND
     return points[:, 2], np.searchsorted(owner, np.arange(len(polygons)))
 
 
-def plane_of(outline: shapely.Polygon) -> Plane:
-    """Least-squares plane through an outline's vertices (PolygonZ, map metres); flat at their mean where they lie on a
-    line in plan or the plane would be steeper than any roof."""
-    points = shapely.get_coordinates(outline.exterior, include_z=True)[:-1]
-    x0, y0, c = points.mean(axis=0)
-    offsets = points[:, :2] - (x0, y0)
-    (a, b), _, rank, _ = np.linalg.lstsq(offsets, points[:, 2] - c, rcond=1e-6)
-    if rank < 2 or np.hypot(a, b) > STEEPEST:
-        a = b = 0.0
-    return Plane(float(a), float(b), float(c), float(x0), float(y0))
+def planes_of(outlines: NDArray[np.object_]) -> NDArray[np.float64]:
+    """Least-squares planes (n, 5: a, b, c, x0, y0) through the outer vertices of outlines (PolygonZ, map metres).
+
+    Flat at their mean where the vertices lie on a line in plan, or the plane would be steeper than any roof.
+    """
+    points, owner = shapely.get_coordinates(shapely.get_exterior_ring(outlines), include_z=True, return_index=True)
+    last = np.append(owner[1:] != owner[:-1], True)[: len(owner)]
+    points, owner = points[~last], owner[~last]
+
+    def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.bincount(owner, values, len(outlines))
+
+    size = total(np.ones(len(owner)))
+    x0, y0, c = (total(points[:, i]) / size for i in range(3))
+    x, y, z = (points - np.column_stack([x0, y0, c])[owner]).T
+    xx, xy, yy, xz, yz = total(x * x), total(x * y), total(y * y), total(x * z), total(y * z)
+    determinant = xx * yy - xy**2
+    thin = determinant <= 1e-9 * (xx + yy) ** 2
+    safe = np.where(thin, 1.0, determinant)
+    a, b = (yy * xz - xy * yz) / safe, (xx * yz - xy * xz) / safe
+    level = thin | (np.hypot(a, b) > STEEPEST)
+    return np.column_stack([np.where(level, 0.0, a), np.where(level, 0.0, b), c, x0, y0])
 
 
 def visible_labels(truth: Truth, scene: Scene, window: Window) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -304,27 +317,24 @@ def visible_labels(truth: Truth, scene: Scene, window: Window) -> tuple[NDArray[
     terrain = scene.terrain(frame.bounds, margin=500.0)
     projected_on = scene.projected_on(terrain)
 
-    def lifted(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (n, 3) sheared so that one parallel view over height 0 shows them where the image does."""
-        seen = view.image_position(points[:, :2], points[:, 2], scene.lean, projected_on)
-        return np.column_stack([seen + points[:, 2:] * scene.lean, points[:, 2]])
-
     walls = _walls(near.standing, scene.lean, terrain)
-    faces = [zbuffer.Polygon(quad) for quad in lifted(walls.reshape(-1, 3)).reshape(-1, 4, 3)]
-    for outline in near.standing:
-        shell, *holes = (
-            lifted(shapely.get_coordinates(ring, include_z=True)[:-1])
-            for ring in (outline.exterior, *outline.interiors)
-        )
-        faces.append(zbuffer.Polygon(shell, tuple(holes)))
+    rings, owner = shapely.get_rings(near.standing, return_index=True)
+    points, ring = shapely.get_coordinates(rings, include_z=True, return_index=True)
+    # Sheared so that one parallel view over height 0 shows every point where the image does.
+    points = np.vstack([walls.reshape(-1, 3), points])
+    seen = view.image_position(points[:, :2], points[:, 2], scene.lean, projected_on)
+    lifted = np.column_stack([seen + points[:, 2:] * scene.lean, points[:, 2]])
+    faces = [zbuffer.Polygon(quad) for quad in lifted[: 4 * len(walls)].reshape(-1, 4, 3)]
+    parts = [part[:-1] for part in np.split(lifted[4 * len(walls) :], np.flatnonzero(np.diff(ring)) + 1)]
+    first = np.searchsorted(owner, np.arange(len(near.ids) + 1))
+    faces += [zbuffer.Polygon(parts[start], tuple(parts[start + 1 : end])) for start, end in pairwise(first)]
     face = zbuffer.render_faces(faces, scene.lean, frame).face
 
     rows, cols = np.nonzero(face >= len(walls))
     section = face[rows, cols] - len(walls)
     labels[rows, cols] = near.ids[section]
-    planes = np.array([plane_of(outline) for outline in near.standing])
     image = frame.to_map(np.column_stack([cols, rows]) + 0.5)
-    standing, z = view.ray_meets_plane(image, Plane(*planes[section].T), scene.lean, projected_on)
+    standing, z = view.ray_meets_plane(image, Plane(*planes_of(near.standing)[section].T), scene.lean, projected_on)
     heights[rows, cols] = z - terrain(standing)
     return labels, heights
 

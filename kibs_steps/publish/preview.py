@@ -66,21 +66,19 @@ def standing_panel(
     page = Image.fromarray(terrain_shade(scene, size, scale)).resize(large, Image.Resampling.BICUBIC)
     colours, top = by_height(heights)
     lit = shaded(colours, planes[:, 0], planes[:, 1]).tolist()
-    pixels = [
-        [scene.grid.to_image(shapely.get_coordinates(ring)) * scale * FINER for ring in shapely.get_rings(outline)]
-        for outline in outlines
-    ]
+    moved = shapely.transform(outlines, scene.grid.to_image)
+    pixels = picture.rings(moved, scale * FINER)
+    away = SHADOW * np.maximum(heights, 0.0)[:, None] / scene.grid.gsd
     shadow = Image.new("L", large)
     pen = ImageDraw.Draw(shadow)
-    for (shell, *_), height in zip(pixels, heights.tolist(), strict=True):
-        away = SHADOW * max(height, 0.0) / scene.grid.gsd * scale * FINER
-        pen.polygon([tuple(p) for p in shapely.get_coordinates(_swept(shell, away)).tolist()], fill=110)
+    for shell, *_ in picture.rings(_swept(moved, away), scale * FINER):
+        pen.polygon(shell, fill=110)
     shadow = shadow.filter(ImageFilter.GaussianBlur(1.2 * FINER))
     page.paste((40, 44, 60), (0, 0), shadow)
     pen = ImageDraw.Draw(page)
     # From low to high, so that what stands above is drawn last.
     for i in np.argsort(heights, kind="stable"):
-        shell, *holes = ([tuple(p) for p in ring.tolist()] for ring in pixels[i])
+        shell, *holes = pixels[i]
         if holes:
             picture.fill_around(page, shell, holes, tuple(lit[i]))
             pen = ImageDraw.Draw(page)
@@ -91,9 +89,12 @@ def standing_panel(
     return page.resize(size, Image.Resampling.BOX), top
 
 
-def _swept(ring: NDArray[np.float64], away: NDArray[np.float64]) -> shapely.Polygon:
-    """The area a ring covers on its way along a vector: its shadow on level ground, without the notches."""
-    return shapely.convex_hull(shapely.multipoints(np.vstack([ring, ring + away])))
+def _swept(outlines: NDArray[np.object_], away: NDArray[np.float64]) -> NDArray[np.object_]:
+    """The areas that outlines cover on their way along vectors (n, 2): shadows on level ground, without the notches."""
+    shells = shapely.get_exterior_ring(outlines)
+    owner = shapely.get_coordinates(shells, return_index=True)[1]
+    ends = shapely.set_coordinates(shells.copy(), shapely.get_coordinates(shells) + away[owner])
+    return shapely.convex_hull(shapely.multilinestrings(np.column_stack([shells, ends])))
 
 
 def compass(page: Image.Image, centre: tuple[int, int], radius: int) -> None:

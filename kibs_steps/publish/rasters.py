@@ -31,6 +31,7 @@ from kibs_steps.scene import Scene
 from kibs_steps.view import Plane
 
 SIDE = 2048  # px: side of the windows, a multiple of the files' own blocks
+CACHE = 64  # MB that GDAL may keep; its default grows with the machine
 PLANE = ("plane_a", "plane_b", "plane_c", "x0", "y0")
 
 
@@ -83,12 +84,9 @@ def shown(sections: Sections, scene: Scene, window: Window) -> tuple[NDArray[np.
     image = scene.grid.to_map(points)
     _, z = view.ray_meets_plane(image, Plane(*near.planes[owner[ring]].T), scene.lean, projected_on)
     lifted = np.column_stack([image + z[:, None] * scene.lean, z])
-    parts = np.split(lifted, np.flatnonzero(np.diff(ring)) + 1)
+    parts = [part[:-1] for part in np.split(lifted, np.flatnonzero(np.diff(ring)) + 1)]
     first = np.searchsorted(owner, np.arange(len(near.ids) + 1))
-    faces = []
-    for start, end in pairwise(first):
-        shell, *holes = (part[:-1] for part in parts[start:end])
-        faces.append(zbuffer.Polygon(shell, tuple(holes)))
+    faces = [zbuffer.Polygon(parts[start], tuple(parts[start + 1 : end])) for start, end in pairwise(first)]
     face = zbuffer.render_faces(faces, scene.lean, frame).face
 
     rows, cols = np.nonzero(face >= 0)
@@ -146,6 +144,7 @@ def main(argv: list[str] | None = None) -> None:
     sections = read(args.sections)
     tags = {"LICENCE": line} if (line := licences.line(args.models)) else {}
     with (
+        rasterio.Env(GDAL_CACHEMAX=CACHE),
         cloud_optimized(args.labels, scene.grid, "uint32", 0, tags) as labels,
         cloud_optimized(
             args.heights, scene.grid, "float32", float("nan"), {**tags, "UNIT": "m above ground"}
