@@ -329,7 +329,7 @@ def _village(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
     rng = site.rng
     site.paint_street(s0, t0, s1, t1, "lawn" if rng.random() < 0.6 else "rough")
     taken: list[tuple[float, float, float]] = []
-    for _ in range(int((s1 - s0) * (t1 - t0) / rng.uniform(110, 330))):
+    for _ in range(int((s1 - s0) * (t1 - t0) / rng.uniform(70, 240))):
         barn = rng.random() < 0.3
         a, b = (rng.uniform(12, 26), rng.uniform(8, 13)) if barn else (rng.uniform(7, 16), rng.uniform(6, 10))
         edge = rng.random() < 0.55

@@ -383,6 +383,11 @@ def relief(
     return Terrain(z.astype(np.float32).astype(np.float64), float(x[0]), float(y[0]), (step, step))
 
 
+def _roofs_within(city: City, side: float) -> int:
+    """Sections whose first corner stands in the square from (0, 0) to (side, side) m."""
+    return sum(f.kind == ROOF and 0 < f.ring[0, 0] < side and 0 < f.ring[0, 1] < side for f in city.faces)
+
+
 def random_scene(
     rng: np.random.Generator,
     size: int = 256,
@@ -403,7 +408,11 @@ def random_scene(
     if rng.random() < 0.35:
         low, high = -margin - 60, side + margin + 60
         terrain = relief(rng, (low, low, high, high), 2.0, rng.uniform(0, 6), rng.uniform(0, 0.15))
-    city = procedural(rng, side + 2 * margin, side + 2 * margin, terrain, style, (-margin, -margin))
+    wide = side + 2 * margin
+    city = procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+    # Tiles with hardly a roof teach little: most of them are drawn again.
+    while _roofs_within(city, side) < 4 and rng.random() < 0.75:
+        city = procedural(rng, wide, wide, terrain, style, (-margin, -margin))
     picture = render(city, terrain, grid, view, sun, rng, backgrounds if rng.random() < 0.5 else None)
     return picture, geometry_vector(view, sun, gsd)
 
