@@ -223,7 +223,7 @@ def _row(site: Site, s0: float, s1: float, t: float, depth: float, sense: int, e
     over = pick(rng, [0.0, rng.uniform(0.2, 0.5)])
     site.buildings += 1
     number = site.buildings
-    lift, shift, start, i = 0.0, 0.0, 0, 0
+    lift, shift, start = 0.0, 0.0, 0
     if mode == "one" and kind not in ("cross_gable",):
         lengths = [count]
     else:
@@ -843,10 +843,9 @@ def _park(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
                 0.2,
             )
     else:
-        for _ in range(3):
-            site.paint_street(
-                *sorted(rng.uniform(s0, s1, 2))[:1], t0, rng.uniform(s0, s1) + 3, t1, "rough", 0.2
-            ) if rng.random() < 0.3 else None
+        if rng.random() < 0.6:
+            a, b = np.sort(rng.uniform(s0, s1, 2)).tolist()
+            site.paint_street(a, t0, b + 3, t1, "rough", 0.2)
         p = np.cumsum(np.column_stack([np.full(12, 2 * w / 11), rng.normal(0, 4, 12)]), 0) - [w, 0]
         site.paint(place.put(np.concatenate([p, p[::-1] + np.array([0, 2.2])])), "gravel")
     site.trees(s0, t0, s1, t1, {"wood": 3.0, "park": 1.2}.get(what, 0.25) * rng.uniform(0.4, 1.4), 11)

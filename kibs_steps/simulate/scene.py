@@ -61,20 +61,19 @@ def _sample_frame(grid: Grid) -> Grid:
     return Grid(grid.crs, grid.x0 - half / 2, grid.y0 + half / 2, half, 2 * grid.width + 1, 2 * grid.height + 1)
 
 
-def _reference_frame(samples: Grid, drop: np.ndarray, k: np.ndarray) -> Grid:
+def _reference_frame(samples: Grid, drop: np.ndarray, k: tuple[float, float]) -> Grid:
     """The samples' frame grown (by whole samples) to hold all positions P − drop·k on the reference plane."""
-    ends = np.array([drop.min(initial=0), drop.max(initial=0)])
-    left, right = (np.ceil(np.abs(ends * k[0]).max() / samples.gsd) + 1,) * 2
-    top, bottom = (np.ceil(np.abs(ends * k[1]).max() / samples.gsd) + 1,) * 2
-    if not ends.any():
+    reach = float(np.abs(drop).max())
+    if reach == 0:
         return samples
+    across, down = (int(np.ceil(reach * abs(lean) / samples.gsd)) + 1 for lean in k)
     return Grid(
         samples.crs,
-        samples.x0 - left * samples.gsd,
-        samples.y0 + top * samples.gsd,
+        samples.x0 - across * samples.gsd,
+        samples.y0 + down * samples.gsd,
         samples.gsd,
-        int(samples.width + left + right),
-        int(samples.height + top + bottom),
+        samples.width + 2 * across,
+        samples.height + 2 * down,
     )
 
 
@@ -97,7 +96,7 @@ def _see(city: City, terrain: Terrain, samples: Grid, k: tuple[float, float]) ->
     base = float(terrain.heights.flat[0]) if level else float(np.mean(terrain.heights))
     ground = np.full(x_y.shape[:2], base) if level else terrain(x_y)
     through = x_y - (ground - base)[..., None] * np.array(k)
-    frame = _reference_frame(samples, ground - base, np.array(k))
+    frame = _reference_frame(samples, ground - base, k)
     planes = zbuffer.planes(faces)
 
     def look(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,26 +123,25 @@ def _see(city: City, terrain: Terrain, samples: Grid, k: tuple[float, float]) ->
     own = np.array([f.section for f in faces] + [0])
     section = own[solid]
     z = np.where(face < 0, ground, z)
-    points = np.concatenate([through + (z - base)[..., None] * np.array(k), z[..., None]], -1)
-    points[face < 0, :2] = x_y[face < 0]
+    # From the ground nothing moves: a pixel that shows no face shows its own place.
+    rise = np.where(face < 0, 0.0, z - ground)
+    points = np.stack([x_y[..., 0] + rise * k[0], x_y[..., 1] + rise * k[1], z], -1)
     return _Seen(face, points, ground, section, solid_z)
 
 
 def _lit(city: City, seen: _Seen, samples: Grid, sun: tuple[float, float], facing: np.ndarray) -> np.ndarray:
     """Whether the sun reaches each sample: 1 or 0, from a depth map in the sun's own frame."""
-    s = np.array(sun)
     base = float(seen.ground.mean())
-    at = seen.points[..., :2] - (seen.points[..., 2:] - base) * s
-    low, high = at.reshape(-1, 2).min(0), at.reshape(-1, 2).max(0)
     step = samples.gsd
-    width, height = (np.ceil((high - low) / step) + 2).astype(int)
-    frame = Grid("", low[0] - step, high[1] + step, step, int(width), int(height))
-    hits = zbuffer.render_faces(city.faces, sun, frame, base)
-    pixel = np.floor(frame.to_image(at)).astype(int)
-    above = hits.height[pixel[..., 1], pixel[..., 0]]
-    blocker = hits.face[pixel[..., 1], pixel[..., 0]]
-    shaded = (above > seen.points[..., 2] + BIAS) & (blocker != seen.face)
-    return np.where(shaded | ~facing, 0.0, 1.0).astype(np.float32)
+    x, y, z = (seen.points[..., i].ravel() for i in range(3))
+    x, y = x - (z - base) * sun[0], y - (z - base) * sun[1]
+    left, top = x.min() - step, y.max() + step
+    width, height = int((x.max() - left) / step) + 2, int((top - y.min()) / step) + 2
+    hits = zbuffer.render_faces(city.faces, sun, Grid("", left, top, step, width, height), base)
+    pixel = ((top - y) / step).astype(np.int32) * width + ((x - left) / step).astype(np.int32)
+    above, blocker = np.take(hits.height, pixel), np.take(hits.face, pixel)
+    shaded = (above > z + BIAS) & (blocker != seen.face.ravel())
+    return np.where(shaded.reshape(facing.shape) | ~facing, 0.0, 1.0).astype(np.float32)
 
 
 def _paint(city: City, samples: Grid) -> np.ndarray:
