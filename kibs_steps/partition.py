@@ -428,27 +428,27 @@ def _clear(faces: list[Face]) -> list[Face]:
     """Faces whose edges pass through every vertex nearer than `CLEARANCE`, so that nothing almost touches."""
     edges = sorted({(min(e), max(e)) for e in directed_edges(faces)})
     points = sorted({p for e in edges for p in e})
-    lines = shapely.linestrings(np.array(edges, float))
-    e, p = shapely.STRtree(shapely.points(np.array(points, float))).query(lines, "dwithin", CLEARANCE * MM)
-    through: dict[tuple[Point, Point], list[Point]] = defaultdict(list)
-    for i, k in zip(e, p, strict=True):
-        if points[k] not in edges[i]:
-            through[edges[i]].append(points[k])
+    ends, at = np.array(edges, float), np.array(points, float)
+    e, p = shapely.STRtree(shapely.points(at)).query(shapely.linestrings(ends), "dwithin", CLEARANCE * MM)
+    span = ends[e, 1] - ends[e, 0]
+    t = ((at[p] - ends[e, 0]) * span).sum(axis=1) / (span**2).sum(axis=1)
+    through: dict[tuple[Point, Point], list[tuple[float, Point]]] = defaultdict(list)
+    for i, k, along in zip(e, p, t, strict=True):
+        if points[k] not in edges[i] and 0 < along < 1:
+            through[edges[i]].append((float(along), points[k]))
     if not through:
         return faces
 
     def path(u: Point, v: Point) -> list[Point]:
-        between = through.get((min(u, v), max(u, v)), [])
-        return [u, *sorted(between, key=lambda q: hypot(q[0] - u[0], q[1] - u[1]))]
+        between = [q for _, q in sorted(through.get((min(u, v), max(u, v)), []))]
+        return [u, *(between if u < v else between[::-1])]
 
     denser = []
-    for face in faces:
-        own = {
-            e for r in face.rings for u, v in zip(r, [*r[1:], r[0]], strict=True) for e in pairwise([*path(u, v), v])
-        }
-        open_edges = [(u, v) for u, v in own if (v, u) not in own]  # spikes and slits of the face have closed
-        denser += [Face(face.section, region) for region in regions(rings_along(open_edges))]
     try:
+        for face in faces:
+            own = {e for r in face.rings for u, v in zip(r, [*r[1:], r[0]], strict=True) for e in pairwise([*path(u, v), v])}
+            open_edges = [(u, v) for u, v in own if (v, u) not in own]  # spikes and slits of the face have closed
+            denser += [Face(face.section, region) for region in regions(rings_along(open_edges))]
         directed_edges(denser)
     except NoPartition:
         return faces

@@ -19,6 +19,10 @@ import numpy as np
 from kibs_steps.partition import MM, Face, Point, directed_edges
 
 SLOPE_CAP = 75.0  # deg
+UNKNOWN = 0.3  # m, σ of a plane that has none
+MISPLACED = 0.15  # m of height that an edge beside its place makes two planes differ
+PARALLEL = 0.15  # m/m, planes whose gradients differ less are parallel
+COINCIDE = 0.3  # m, parallel planes this near are one level
 TOUCH = 0.1  # m, planes this near at a single vertex are made to meet there
 FLAT_WEIGHT = 1e-4  # of a section whose plane is only a placeholder, per m²
 
@@ -33,8 +37,7 @@ class Together(NamedTuple):
 
 def tolerance(sigma: np.ndarray, reliable: np.ndarray) -> np.ndarray:
     """How far (m) each plane may be lifted at any vertex: three times its σ within 0.25–1 m; placeholders 3 m."""
-    known = np.where(np.isfinite(sigma), sigma, 0.3)
-    return np.where(reliable, np.clip(3 * known, 0.25, 1.0), 3.0)
+    return np.where(reliable, np.clip(3 * sigma, 0.25, 1.0), 3.0)
 
 
 def bring_together(
@@ -46,8 +49,9 @@ def bring_together(
     `reliable` (n,): False for sections whose plane is a flat placeholder, which then follow their neighbours.
     """
     n = len(planes)
+    sigma = np.where(np.isfinite(sigma), sigma, UNKNOWN)
     spare = tolerance(sigma, reliable)
-    weight = np.where(reliable, 1 / np.maximum(np.where(np.isfinite(sigma), sigma, 0.3), 0.05) ** 2, FLAT_WEIGHT)
+    weight = np.where(reliable, 1 / np.maximum(sigma, 0.05) ** 2, FLAT_WEIGHT)
     owner = np.array([f.section for f in faces for ring in f.rings for _ in ring])
     xy = np.array([p for f in faces for ring in f.rings for p in ring], float) / MM
     centre = np.zeros((n, 2))
@@ -83,7 +87,7 @@ def bring_together(
     y = np.einsum("nij,ni->nj", factor, original).ravel()
     basis = np.empty((0, 3 * n))
     closed = steps = 0
-    for f, g, ends in _agreements(faces, planes, spare):
+    for f, g, ends in _agreements(faces, planes, sigma, reliable):
         directions = basis
         for vertex in ends:
             row = equation(f, g, vertex)
@@ -106,11 +110,12 @@ def bring_together(
 
 
 def _agreements(
-    faces: Sequence[Face], planes: np.ndarray, spare: np.ndarray
+    faces: Sequence[Face], planes: np.ndarray, sigma: np.ndarray, reliable: np.ndarray
 ) -> list[tuple[int, int, tuple[Point, ...]]]:
-    """Equations worth trying: shared edges whose two ends agree within both sections' tolerance, best first; then vertices.
+    """Equations worth trying: shared edges whose planes agree at both ends, best first; then vertices.
 
-    Each is (section, section, vertices at which they should have one height).
+    Each is (section, section, vertices at which they should have one height). Planes agree within 2.5 σ of their difference and
+    what a misplaced edge makes of it; parallel ones, which would have to bend, only if they nearly coincide.
     """
     edges = directed_edges(faces)
     along, single = [], []
@@ -121,9 +126,14 @@ def _agreements(
         f, g = faces[k].section, faces[other].section
         if f == g:
             continue
+        if not (reliable[f] and reliable[g]):
+            reach = 3.0
+        elif np.hypot(*(planes[f] - planes[g])[:2]) < PARALLEL:
+            reach = COINCIDE
+        else:
+            reach = float(np.clip(2.5 * np.hypot(sigma[f], sigma[g]), 0.25, 1.2)) + MISPLACED
         apart = [abs(float((planes[f] - planes[g]) @ (p[0] / MM, p[1] / MM, 1.0))) for p in (u, v)]
-        reach = float(spare[f] + spare[g])
         if max(apart) <= reach:
             along.append((round(max(apart) / reach, 9), f, g, (min(u, v), max(u, v))))
-        single += [(round(a, 9), f, g, (p,)) for a, p in zip(apart, (u, v), strict=True) if a <= min(TOUCH, reach)]
+        single += [(round(a, 9), f, g, (p,)) for a, p in zip(apart, (u, v), strict=True) if a <= TOUCH]
     return [candidate[1:] for candidate in sorted(along) + sorted(single)]

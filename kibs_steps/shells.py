@@ -40,8 +40,8 @@ def shells(faces: list[Face], planes: np.ndarray, ground: int) -> list[list[Surf
     `planes` (n, 3): z (m) = a·x + b·y + c by section; `ground` mm. Every roof must be above ground. Raises `NoPartition`
     where alternating heights cannot be chamfered.
     """
-    faces = _cut_where_profiles_cross(faces, planes)
     for _ in range(8):
+        faces = _cut_where_profiles_cross(faces, planes)
         levels = column_heights(faces, planes)
         bad = _alternating(faces, levels)
         if not bad:

@@ -224,12 +224,12 @@ def _base(built: list[list[Surface]], origin: tuple[int, int]) -> shapely.Geomet
 def roof_type(faces: list[Face], planes: np.ndarray) -> str:
     """flat, shed, gable, hip, pyramid or complex, from the number and the directions of the slopes.
 
-    Sections below 5 % of the roof do not count, nor do level ones below 15 % in all beside slopes.
+    Sections below a tenth of the largest do not count, nor do level ones below 15 % in all beside slopes.
     """
     shapes = _shapes(faces)
     area = np.bincount([f.section for f in faces], shapely.area(shapes), minlength=len(planes))
     slope, azimuth = slope_azimuth(planes[:, 0], planes[:, 1], 0.0)
-    counted = area >= 0.05 * area.sum()
+    counted = area >= 0.1 * area.max()
     pitched = np.flatnonzero(counted & (slope >= PITCHED))
     level = area[counted & (slope < PITCHED)].sum() / area[counted].sum()
     if not len(pitched):
