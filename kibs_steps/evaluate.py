@@ -116,8 +116,9 @@ class Corners(NamedTuple):
 
 
 def count_pairs(truth_labels: NDArray, labels: NDArray) -> Pairs:
-    """Pairs of two label images of one shape."""
-    key = (truth_labels.astype(np.int64).ravel() << 32) | labels.astype(np.int64).ravel()
+    """Pairs of two label images of one shape; pixels with neither are left out."""
+    either = (truth_labels > 0) | (labels > 0)
+    key = (truth_labels[either].astype(np.int64) << 32) | labels[either].astype(np.int64)
     key, pixels = np.unique(key, return_counts=True)
     return Pairs(key >> 32, key & 0xFFFFFFFF, pixels)
 
