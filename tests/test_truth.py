@@ -7,9 +7,12 @@ import pyogrio
 import pytest
 import shapely
 import toy_city as toy
+from affine import Affine
 
-from kibs_steps import store, truth
-from kibs_steps.grid import Window
+from kibs_steps import raster, store, truth, view
+from kibs_steps.grid import Grid, Window
+from kibs_steps.scene import Direction
+from kibs_steps.simulate import scene as simulation
 
 
 def write_layer(path, outlines, crs=toy.CRS, layer="anything", kind="Polygon Z", **columns):
@@ -248,3 +251,27 @@ def test_main_writes_the_table(tmp_path):
     truth.main(arguments)
     assert out.read_bytes() == first
     assert store.read_table(out).num_rows == 4
+
+
+def test_the_simulator_sees_the_same(tmp_path):
+    """Another program's rendering of a hilly city: same sections but for rim pixels, and the same heights."""
+    grid = Grid(toy.CRS, 500000.0, 5400000.0, 0.38, 300, 300)
+    towards, sun = (Direction(*angles, view.lean(*angles)) for angles in ((181.1, 59.3), (155.0, 45.0)))
+    picture, terrain = simulation.simulate(5, grid, towards, sun, "mixed", 3.0, 0.05)
+    scene = toy.make_scene(tmp_path)._replace(grid=grid, view=towards)
+    (step, _), heights = terrain.step, terrain.heights
+    corner = Affine(step, 0, terrain.x0 - step / 2, 0, -step, terrain.y0 + step / 2)
+    raster.write(tmp_path / "dtm.tif", heights.astype(np.float64), toy.CRS, corner)
+
+    found = picture.sections
+    standing = [shapely.orient_polygons(shapely.Polygon(s.outline_map, s.holes_map)) for s in found]
+    seen = np.array([shapely.Polygon(s.outline_seen, s.holes_seen) for s in found])
+    ids = np.array([s.section for s in found])
+    reach = shapely.bounds(seen) + np.array([-60, -60, 60, 60])
+    sections = truth.Truth(ids, np.full(len(ids), 2), seen, np.array(standing), reach)
+    labels, heights = truth.visible_labels(sections, scene, whole(scene))
+    roof = picture.section > 0
+    same = roof & (labels == picture.section)
+    assert roof.sum() > 5000
+    assert same.sum() > 0.98 * roof.sum()
+    np.testing.assert_allclose(heights[same], picture.height[same], atol=1e-4)
