@@ -46,6 +46,13 @@ class Face(NamedTuple):
     rings: list[Ring]
 
 
+class Partition(NamedTuple):
+    """The faces of a building; whether its sections fitted exactly as they came."""
+
+    faces: list[Face]
+    exact: bool
+
+
 class NoPartition(KibsError):
     """Sections that cannot be made into a partition."""
 
@@ -55,7 +62,7 @@ def partition(
     planes: np.ndarray,
     reliable: np.ndarray,
     gap: float = GAP,
-) -> list[Face]:
+) -> Partition:
     """The faces of a building.
 
     `polygons`: n polygons (m, any validity); `planes`: (n, 3) coefficients of z = a·x + b·y + c in the same frame;
@@ -65,13 +72,14 @@ def partition(
     cleaned = [polygonal(p) for p in polygons]
     if all(p.is_empty for p in cleaned):
         raise NoPartition("no section has an area")
-    for reach, narrow in ((EXACT, REACH), (REACH, gap)):
-        faces, fits = _tile(cleaned, planes, reliable, reach, narrow)
-        if not faces:
-            raise NoPartition("no section is wide enough to stand")
-        if fits:
-            return straightened(_clear(_contracted(faces, 2 * EXACT)), STRAIGHT)
-    return _clear(_regular(faces, NOISE))
+    faces, exact = _tile(cleaned, planes, reliable, EXACT, REACH)
+    if not exact:
+        faces, _ = _tile(cleaned, planes, reliable, REACH, gap)
+    if not faces:
+        raise NoPartition("no section is wide enough to stand")
+    if exact:
+        return Partition(straightened(_clear(_contracted(faces, 2 * EXACT)), STRAIGHT), True)
+    return Partition(_clear(_regular(faces, NOISE)), False)
 
 
 def polygonal(geometry: shapely.Geometry | None) -> shapely.Geometry:
@@ -446,7 +454,12 @@ def _clear(faces: list[Face]) -> list[Face]:
     denser = []
     try:
         for face in faces:
-            own = {e for r in face.rings for u, v in zip(r, [*r[1:], r[0]], strict=True) for e in pairwise([*path(u, v), v])}
+            own = {
+                e
+                for r in face.rings
+                for u, v in zip(r, [*r[1:], r[0]], strict=True)
+                for e in pairwise([*path(u, v), v])
+            }
             open_edges = [(u, v) for u, v in own if (v, u) not in own]  # spikes and slits of the face have closed
             denser += [Face(face.section, region) for region in regions(rings_along(open_edges))]
         directed_edges(denser)
@@ -492,13 +505,13 @@ def _regular(faces: list[Face], noise: float) -> list[Face]:
         return straightened(faces, STRAIGHT)
     simple = shapely.orient_polygons(shapely.coverage_simplify(np.array(shapes, object), noise))
     simpler = [Face(f.section, _rings_of(p)) for f, p in zip(faces, simple, strict=True) if not p.is_empty]
-    if _is_coverage(simpler):
+    if is_coverage(simpler):
         faces = simpler
     contracted = straightened(_contracted(faces, noise), noise / 5)
-    return contracted if _is_coverage(contracted) else straightened(faces, STRAIGHT)
+    return contracted if is_coverage(contracted) else straightened(faces, STRAIGHT)
 
 
-def _is_coverage(faces: list[Face]) -> bool:
+def is_coverage(faces: list[Face]) -> bool:
     """Whether faces are valid polygons that tile without overlap."""
     if any(len(set(r)) < len(r) or len(r) < 3 for f in faces for r in f.rings):
         return False

@@ -11,14 +11,19 @@ more than its tolerance, or tilt it beyond the slope cap, is not imposed.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from kibs_steps.partition import MM, Face, Point, directed_edges
+from kibs_steps.partition import MM, Face, Point, directed_edges, is_coverage
 
 SLOPE_CAP = 75.0  # deg
+PLACE = 0.35  # m, σ of a vertex's place where sections did not fit
+LEVELLED = 0.1  # m, σ of heights that should be one
+AGREE = 1.2  # m, planes farther apart at a vertex are at a step
+FARTHEST = 0.6  # m, how far a vertex is moved
 UNKNOWN = 0.3  # m, σ of a plane that has none
 MISPLACED = 0.15  # m of height that an edge beside its place makes two planes differ
 PARALLEL = 0.15  # m/m, planes whose gradients differ less are parallel
@@ -107,6 +112,44 @@ def bring_together(
     result = to_planes(y)
     result[:, 2] -= (result[:, :2] * centre).sum(axis=1)
     return Together(result, closed, steps)
+
+
+def drawn_to_planes(faces: list[Face], planes: np.ndarray) -> list[Face]:
+    """Faces whose shared vertices are moved toward where the planes that meet there have one height.
+
+    Meant for outlines that were found no better than `PLACE`: a ridge seen half a metre beside its place is put where its two
+    planes cross, instead of bending the planes. On the building's outline a vertex moves along a straight stretch
+    only. Vertices at steps stay, and all do if the faces would no longer tile.
+    """
+    edges = directed_edges(faces)
+    sections: dict[Point, set[int]] = defaultdict(set)
+    rim: dict[Point, list[Point]] = defaultdict(list)
+    for (u, v), f in edges.items():
+        sections[u].add(faces[f].section)
+        if (v, u) not in edges:
+            rim[u].append(v)
+            rim[v].append(u)
+    moved: dict[Point, Point] = {}
+    for point, meeting in sections.items():
+        met = planes[sorted(meeting)]
+        heights = met @ (point[0] / MM, point[1] / MM, 1.0)
+        if len(met) < 2 or np.ptp(heights) > AGREE:
+            continue
+        ways = np.eye(2)
+        if point in rim:
+            there = np.subtract(rim[point], point) / np.hypot(*np.subtract(rim[point], point).T)[:, None]
+            if (
+                len(there) != 2 or there[0] @ there[1] > -0.94
+            ):  # a corner of the building, or a point it touches itself in
+                continue
+            ways = ((there[1] - there[0]) / np.hypot(*(there[1] - there[0])))[:, None]
+        tilt = (met[:, :2] - met[:, :2].mean(axis=0)) @ ways
+        stiff = tilt.T @ tilt + (LEVELLED / PLACE) ** 2 * np.eye(tilt.shape[1])
+        way = -ways @ np.linalg.solve(stiff, tilt.T @ (heights - heights.mean()))
+        way *= min(1.0, FARTHEST / max(np.hypot(*way), 1e-9))
+        moved[point] = (round(point[0] + way[0] * MM), round(point[1] + way[1] * MM))
+    drawn = [Face(f.section, [[moved.get(p, p) for p in ring] for ring in f.rings]) for f in faces]
+    return drawn if is_coverage(drawn) else faces
 
 
 def _agreements(

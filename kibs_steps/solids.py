@@ -23,7 +23,7 @@ from kibs_steps.buildings import hidden
 from kibs_steps.errors import KibsError
 from kibs_steps.ground import slope_azimuth
 from kibs_steps.partition import GAP, MM, Face, NoPartition, dissolved, partition, polygon, polygonal
-from kibs_steps.planes_together import SLOPE_CAP, bring_together
+from kibs_steps.planes_together import SLOPE_CAP, bring_together, drawn_to_planes
 from kibs_steps.shells import GROUND, ROOF, WALL, Surface
 from kibs_steps.terrain import Terrain
 
@@ -90,7 +90,10 @@ def build(sections: Sections, dtm: Terrain, lod_label: str = "2.0", gap: float =
     """The most detailed valid solid of a building; never raises on geometry. `gap` (m) as in `partition`."""
     refused: list[str] = []
     try:
-        faces, planes = partition(sections.polygons, sections.planes, sections.fitted, gap), sections.planes
+        faces, exact = partition(sections.polygons, sections.planes, sections.fitted, gap)
+        planes = sections.planes
+        if not exact:
+            faces = drawn_to_planes(faces, planes)
     except CANNOT as error:
         refused.append(f"{lod_label} and 1.3: {error}")
         try:
@@ -178,7 +181,7 @@ def _one_polygon(sections: Sections) -> tuple[list[Face], np.ndarray]:
     centre = shapely.get_coordinates([p.centroid if p.area else shapely.Point(0, 0) for p in shapes])
     mean = (sections.planes * np.c_[centre, np.ones(len(area))]).sum(axis=1)
     plane = np.array([[0.0, 0.0, float((area * mean).sum() / area.sum())]])
-    return partition([shapely.union_all(shapes)], plane, np.ones(1, bool)), plane
+    return partition([shapely.union_all(shapes)], plane, np.ones(1, bool)).faces, plane
 
 
 def _nothing(sections: Sections, dtm: Terrain, refused: list[str]) -> Solid:
