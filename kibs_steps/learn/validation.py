@@ -151,14 +151,9 @@ def photographed(data: Path, source: Path, count: int, size: int) -> list[datase
     return samples
 
 
-def sections_of(
-    model: contracts.Model, samples: Sequence[dataset.Sample]
-) -> tuple[list[dict[str, np.ndarray]], list[heads.Sections]]:
-    """Raw maps and decoded sections of every sample."""
-    raw = []
-    for sample in samples:
-        raw.append(runtime.open_network(model, sample.geometry[None], threads=1)(sample.rgb))
-    return raw, [heads.decode_sections(maps, model.contract) for maps in raw]
+def raw_sections(model: contracts.Model, samples: Sequence[dataset.Sample]) -> list[dict[str, np.ndarray]]:
+    """A sections model's maps of every sample."""
+    return [runtime.open_network(model, sample.geometry[None], threads=1)(sample.rgb) for sample in samples]
 
 
 def judge_sections(
@@ -177,6 +172,21 @@ def judge_sections(
         "truths": sum(r.truths for r in results),
         "found": sum(len(r.scores) for r in results),
     }
+
+
+def best_thresholds(
+    raw: Sequence[dict[str, np.ndarray]], samples: Sequence[dataset.Sample], contract: dict[str, Any]
+) -> dict[str, float]:
+    """The pair of `roof` and `marker` thresholds with the best AP at overlap 0.5 over the samples, by trying a grid."""
+
+    def score(roof: float, marker: float) -> float:
+        tried = {**contract, "thresholds": {**contract["thresholds"], "roof": roof, "marker": marker}}
+        found = [heads.decode_sections(maps, tried) for maps in raw]
+        return average_precision(matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True))
+
+    grid = [(roof, marker) for roof in (0.35, 0.45, 0.55) for marker in (0.35, 0.45, 0.55, 0.65, 0.75)]
+    roof, marker = max(grid, key=lambda pair: score(*pair))
+    return {"roof": roof, "marker": marker}
 
 
 def judge_corners(
@@ -241,6 +251,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=12, help="simulated and pasted scenes each")
     parser.add_argument("--out", required=True, help="report, JSON")
     parser.add_argument("--pictures", help="folder for one picture per test set")
+    parser.add_argument("--choose", action="store_true", help="first choose roof and marker thresholds on these sets")
     args = parser.parse_args(argv)
     model = contracts.load(args.sections, "sections")
     corner_model = contracts.load(args.corners, "corners") if args.corners else None
@@ -253,9 +264,20 @@ def main(argv: list[str] | None = None) -> None:
         "simulated": simulated(args.count, size, (50.0, 90.0)),
         "simulated_oblique": simulated(args.count, size, (args.elevation, args.elevation)),
     }
+    raw_maps = {name: raw_sections(model, samples) for name, samples in sets.items()}
     report: dict[str, Any] = {}
+    if args.choose:
+        chosen = ("village", "simulated", "simulated_oblique")
+        report["thresholds"] = best_thresholds(
+            [maps for name in chosen for maps in raw_maps[name]],
+            [sample for name in chosen for sample in sets[name]],
+            model.contract,
+        )
+        model.contract["thresholds"].update(report["thresholds"])
+        print(report["thresholds"])
     for name, samples in sets.items():
-        raw, found = sections_of(model, samples)
+        raw = raw_maps[name]
+        found = [heads.decode_sections(maps, model.contract) for maps in raw]
         report[name] = judge_sections(raw, found, samples, model.contract["thresholds"]["roof"])
         if corner_model and name.startswith("simulated"):
             report[name]["corners"] = judge_corners(corner_model, samples, [f.labels for f in found])
