@@ -4,6 +4,7 @@ from pathlib import Path
 
 import yaml
 from snakemake.exceptions import WorkflowError
+from snakemake.io import IOFile
 
 from kibs_steps import plan as plans
 from kibs_steps.errors import KibsError
@@ -39,6 +40,9 @@ onstart:
         }
     ):
         logger.info(line)
+    for p in PLANS.values():
+        for warning in p.warnings:
+            logger.warning(f"{p.name}: {warning}")
 
 
 wildcard_constraints:
@@ -71,14 +75,35 @@ def options(*keys):
     return tokens
 
 
+def inputs(step, output):
+    """How a rule with that step's signature and (first) output takes its inputs: `given = inputs(...); given(path)`.
+
+    While the output was made under the present signature, nothing that happens to its inputs concerns it (a neighbouring
+    block made again gives the same bytes), so they are `ancient`. Otherwise they are plain inputs, and what makes them
+    again makes the output again.
+    """
+
+    def given(files):
+        def choose(wildcards):
+            found = files(wildcards) if callable(files) else files.format(**wildcards)
+            path = output.format(**wildcards)
+            recorded = workflow.persistence.params(IOFile(path)) or []
+            current = (
+                Path(path).exists() and repr(signature(step)(wildcards)) in recorded
+            )
+            return ancient(found) if current else found
+
+        return choose
+
+    return given
+
+
 def blocks(path):
-    """An input function: a file of every block of the scene, never compared by date (signatures decide)."""
-    return lambda wildcards: ancient(
-        [
-            f"results/{wildcards.scene}/blocks/{b.name}/{path}"
-            for b in plan(wildcards).blocks
-        ]
-    )
+    """A file of every block of the scene."""
+    return lambda wildcards: [
+        f"results/{wildcards.scene}/blocks/{b.name}/{path}"
+        for b in plan(wildcards).blocks
+    ]
 
 
 include: "workflow/rules/scene.smk"

@@ -51,6 +51,7 @@ class Plan(NamedTuple):
     blocks: list[Block]
     models: dict[str, contract.Model]
     signature: dict[str, str]
+    warnings: list[str]
 
     @property
     def terrain_files(self) -> list[str]:
@@ -138,7 +139,22 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
     blocks = tiling.blocks(width, height)
     signature = signatures(settings, source, truth_source, models, tiling, cache)
-    return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature)
+    warnings = [] if settings["feed"] == "truth" else angle_warnings(settings, models)
+    return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings)
+
+
+def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) -> list[str]:
+    """What the models say of the scene's angles; raises `contract.AngleOutsideTraining` where they refuse them."""
+
+    def direction(name: str) -> dict[str, float] | None:
+        angles = {angle: settings.get(f"{name}_{angle}") for angle in ("azimuth", "elevation")}
+        return angles if None not in angles.values() else None
+
+    found = [
+        contract.check_angles(model, direction("view"), direction("sun"), settings["allow_angles"])
+        for model in models.values()
+    ]
+    return list(dict.fromkeys(warning for warnings in found for warning in warnings))
 
 
 def folder_of(models: str, base: Path) -> Path:
@@ -182,7 +198,7 @@ def signatures(
     s["truth"] = h(s["scene"], truth, some("truth_frame", "truth_z"))
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
-        s[f"model_{task}"] = h(model.sha256, angles, settings["allow_angles"], str(model.path))
+        s[f"model_{task}"] = h(model.sha256, str(model.path))
     s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"])
     s["blend"] = h(s["sections"], models["corners"].sha256)
     s["corners"] = h(s["blend"], seen["corners"])

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import sys
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -179,15 +178,9 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.models.contract", description=main.__doc__)
     parser.add_argument("model", help="ONNX file")
     parser.add_argument("--task", choices=["sections", "corners"], help="refuse a model that does not do this")
-    parser.add_argument("--scene", help="scene.json: check its angles against what the model was trained on")
-    parser.add_argument("--allow-angles", action="store_true", help="run although the model never saw such angles")
     parser.add_argument("--out", help="write JSON here instead of printing it")
     args = parser.parse_args(argv)
     model = load(args.model, args.task)
-    if args.scene:
-        facts = store.read_json(args.scene)
-        for warning in check_angles(model, facts["view"], facts["sun"], args.allow_angles):
-            print(f"warning: {warning}", file=sys.stderr)
     content = {"file": str(model.path), "sha256": model.sha256, "contract": model.contract}
     if args.out:
         store.write_json(args.out, content)

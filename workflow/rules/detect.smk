@@ -1,12 +1,15 @@
 # Sections and corners of every block, by the models or from the truth, and their union over the seams.
 
 
+given = inputs("sections", "results/{scene}/blocks/{block}/sections.tif")
+
+
 rule sections:
     """Find the roof sections of one block with the 2D model."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        tiles=ancient("results/{scene}/blocks/{block}/tiles.tif"),
-        model=ancient("results/{scene}/models/sections.json"),
+        scene=given("results/{scene}/scene.json"),
+        tiles=given("results/{scene}/blocks/{block}/tiles.tif"),
+        model=given("results/{scene}/models/sections.json"),
     output:
         labels="results/{scene}/blocks/{block}/sections.tif",
         pieces="results/{scene}/blocks/{block}/detected/pieces.parquet",
@@ -25,13 +28,16 @@ rule sections:
         " --links {output.links:q} --seams {output.seams:q} > {log:q} 2>&1"
 
 
+given = inputs("blend", "results/{scene}/blocks/{block}/blended.tif")
+
+
 rule blend:
     """Paint the sections into the image, as the 3D model's contract says."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        tiles=ancient("results/{scene}/blocks/{block}/tiles.tif"),
-        labels=ancient("results/{scene}/blocks/{block}/sections.tif"),
-        model=ancient("results/{scene}/models/corners.json"),
+        scene=ancient("results/{scene}/scene.json"),  # for the grid, which changes with the tiles
+        tiles=given("results/{scene}/blocks/{block}/tiles.tif"),
+        labels=given("results/{scene}/blocks/{block}/sections.tif"),
+        model=given("results/{scene}/models/corners.json"),
     output:
         temp("results/{scene}/blocks/{block}/blended.tif"),
     log:
@@ -46,12 +52,15 @@ rule blend:
         " --model {input.model:q} --name {wildcards.block} --block {params.block} --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("corners", "results/{scene}/blocks/{block}/detected/corners.parquet")
+
+
 rule corners:
     """Find the roof corners of one block and their heights with the 3D model."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        blended=ancient("results/{scene}/blocks/{block}/blended.tif"),
-        model=ancient("results/{scene}/models/corners.json"),
+        scene=given("results/{scene}/scene.json"),
+        blended=given("results/{scene}/blocks/{block}/blended.tif"),
+        model=given("results/{scene}/models/corners.json"),
     output:
         "results/{scene}/blocks/{block}/detected/corners.parquet",
     log:
@@ -66,11 +75,14 @@ rule corners:
         " --name {wildcards.block} --block {params.block} --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("truth", "results/{scene}/truth.parquet")
+
+
 rule truth:
     """The truth layer in the image frame and the map frame."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        truth=lambda w: ancient(plan(w).truth),
+        scene=given("results/{scene}/scene.json"),
+        truth=given(lambda w: plan(w).truth),
     output:
         "results/{scene}/truth.parquet",
     log:
@@ -86,11 +98,14 @@ rule truth:
         " --z {params.z} --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("feed", "results/{scene}/blocks/{block}/fed/pieces.parquet")
+
+
 rule feed:
     """The truth of one block in the place of both models."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        truth=ancient("results/{scene}/truth.parquet"),
+        scene=given("results/{scene}/scene.json"),
+        truth=given("results/{scene}/truth.parquet"),
     output:
         pieces="results/{scene}/blocks/{block}/fed/pieces.parquet",
         links="results/{scene}/blocks/{block}/fed/links.parquet",
@@ -115,20 +130,22 @@ def source(wildcards):
     return "fed" if plan(wildcards).settings["feed"] == "truth" else "detected"
 
 
+def detections(wildcards):
+    """What `stitch` joins: four files of every block."""
+    files = ("pieces.parquet", "links.parquet", "seams.npz", "corners.parquet")
+    return [
+        f for name in files for f in blocks(f"{source(wildcards)}/{name}")(wildcards)
+    ]
+
+
+given = inputs("stitch", "results/{scene}/stitched/sections.parquet")
+
+
 rule stitch:
     """Join the pieces of all blocks to sections."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        detections=lambda w: [
-            ancient(f"results/{w.scene}/blocks/{b.name}/{source(w)}/{f}")
-            for b in plan(w).blocks
-            for f in (
-                "pieces.parquet",
-                "links.parquet",
-                "seams.npz",
-                "corners.parquet",
-            )
-        ],
+        scene=given("results/{scene}/scene.json"),
+        detections=given(detections),
     output:
         sections="results/{scene}/stitched/sections.parquet",
         corners="results/{scene}/stitched/corners.parquet",

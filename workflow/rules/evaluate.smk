@@ -1,14 +1,17 @@
 # Comparison with truth, where a scene has it.
 
 
+given = inputs("evaluate", "results/{scene}/evaluation.json")
+
+
 rule evaluation:
     """Metrics of labels, heights and sections against the truth."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        truth=ancient("results/{scene}/truth.parquet"),
-        labels=ancient("results/{scene}/labels.tif"),
-        heights=ancient("results/{scene}/heights.tif"),
-        sections=ancient("results/{scene}/buildings.parquet"),
+        scene=given("results/{scene}/scene.json"),
+        truth=given("results/{scene}/truth.parquet"),
+        labels=given("results/{scene}/labels.tif"),
+        heights=given("results/{scene}/heights.tif"),
+        sections=given("results/{scene}/buildings.parquet"),
     output:
         evaluation="results/{scene}/evaluation.json",
         picture="results/{scene}/evaluation.png",

@@ -1,6 +1,13 @@
 # Training; needs the extra `learn` (torch). Checkpoints stay in runs/, so the same command goes on after a kill.
 
-TRAIN = {"name": "mine", "data": None, "minutes": 90, "seed": 0, "tiles": 4000, **(config.get("train") or {})}
+TRAIN = {
+    "name": "mine",
+    "data": None,
+    "minutes": 90,
+    "seed": 0,
+    "tiles": 4000,
+    **(config.get("train") or {}),
+}
 
 
 rule trained:
@@ -17,7 +24,11 @@ rule trained:
         data=TRAIN["data"],
         minutes=TRAIN["minutes"],
         options=[f"--seed={TRAIN['seed']}", f"--tiles={TRAIN['tiles']}"],
-        init=lambda w: [f"--init=runs/{w.name}/sections/checkpoint.pt"] if w.task == "corners" else [],
+        init=lambda w: (
+            [f"--init=runs/{w.name}/sections/checkpoint.pt"]
+            if w.task == "corners"
+            else []
+        ),
     shell:
         "(python -m kibs_steps.learn.training --task {wildcards.task} --data {params.data:q}"
         " --minutes {params.minutes} {params.options:q} {params.init:q} --out runs/{wildcards.name:q}/{wildcards.task}"
@@ -28,4 +39,8 @@ rule trained:
 rule train:
     """Train both networks of a model set (config key `train`: name, data, minutes, seed, tiles)."""
     input:
-        expand("models/{name}/{task}.onnx", name=TRAIN["name"], task=["sections", "corners"]),
+        expand(
+            "models/{name}/{task}.onnx",
+            name=TRAIN["name"],
+            task=["sections", "corners"],
+        ),

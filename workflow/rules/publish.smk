@@ -23,17 +23,20 @@ def licensed(wildcards):
     tasks = (
         [] if plan(wildcards).settings["feed"] == "truth" else ["sections", "corners"]
     )
-    return ancient([f"results/{wildcards.scene}/models/{task}.json" for task in tasks])
+    return [f"results/{wildcards.scene}/models/{task}.json" for task in tasks]
+
+
+given = inputs("solids", "results/{scene}/city.gpkg")
 
 
 rule geopackage:
     """city.gpkg: buildings, footprints, roof sections, corners, blocks."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        sections=ancient("results/{scene}/buildings.parquet"),
-        solids=blocks("solids.parquet"),
-        corners=blocks("filed_corners.parquet"),
-        models=licensed,
+        scene=given("results/{scene}/scene.json"),
+        sections=given("results/{scene}/buildings.parquet"),
+        solids=given(blocks("solids.parquet")),
+        corners=given(blocks("filed_corners.parquet")),
+        models=given(licensed),
     output:
         "results/{scene}/city.gpkg",
     log:
@@ -50,11 +53,14 @@ rule geopackage:
         " --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("solids", "results/{scene}/city.city.json")
+
+
 rule cityjson:
     """city.city.json and city.city.jsonl."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        solids=blocks("solids.city.jsonl"),
+        scene=given("results/{scene}/scene.json"),
+        solids=given(blocks("solids.city.jsonl")),
     output:
         city="results/{scene}/city.city.json",
         sequence="results/{scene}/city.city.jsonl",
@@ -69,10 +75,13 @@ rule cityjson:
         " --out {output.city:q} --seq {output.sequence:q} > {log:q} 2>&1"
 
 
+given = inputs("buildings", "results/{scene}/points.txt")
+
+
 rule points:
     """points.txt: one line per section corner."""
     input:
-        ancient("results/{scene}/buildings.parquet"),
+        given("results/{scene}/buildings.parquet"),
     output:
         "results/{scene}/points.txt",
     log:
@@ -85,13 +94,16 @@ rule points:
         "python -m kibs_steps.publish.points --sections {input:q} --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("buildings", "results/{scene}/labels.tif")
+
+
 rule rasters:
     """heights.tif and labels.tif in the image frame."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        dtm=ancient("results/{scene}/dtm.tif"),
-        sections=ancient("results/{scene}/buildings.parquet"),
-        models=licensed,
+        scene=given("results/{scene}/scene.json"),
+        dtm=given("results/{scene}/dtm.tif"),
+        sections=given("results/{scene}/buildings.parquet"),
+        models=given(licensed),
     output:
         labels="results/{scene}/labels.tif",
         heights="results/{scene}/heights.tif",
@@ -106,12 +118,15 @@ rule rasters:
         " --models {input.models:q} --labels {output.labels:q} --heights {output.heights:q} > {log:q} 2>&1"
 
 
+given = inputs("buildings", "results/{scene}/preview.png")
+
+
 rule preview:
     """preview.png: the raster with the roof sections found."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        raster=lambda w: ancient(plan(w).raster),
-        sections=ancient("results/{scene}/buildings.parquet"),
+        scene=given("results/{scene}/scene.json"),
+        raster=given(lambda w: plan(w).raster),
+        sections=given("results/{scene}/buildings.parquet"),
     output:
         "results/{scene}/preview.png",
     log:
@@ -125,14 +140,17 @@ rule preview:
         " --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("run", "results/{scene}/run.json")
+
+
 rule record:
     """run.json: versions, hashes, models and their licences, counts."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        sources=lambda w: ancient([plan(w).raster, *plan(w).terrain_files]),
-        models=licensed,
-        sections=ancient("results/{scene}/buildings.parquet"),
-        solids=blocks("solids.parquet"),
+        scene=given("results/{scene}/scene.json"),
+        sources=given(lambda w: [plan(w).raster, *plan(w).terrain_files]),
+        models=given(licensed),
+        sections=given("results/{scene}/buildings.parquet"),
+        solids=given(blocks("solids.parquet")),
     output:
         "results/{scene}/run.json",
     log:

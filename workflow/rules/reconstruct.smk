@@ -1,14 +1,17 @@
 # From sections and corners to planes, to where roofs stand, to buildings and solids.
 
 
+given = inputs("planes", "results/{scene}/blocks/{block}/planes.parquet")
+
+
 rule planes:
     """Fit a plane to every section of one block."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        dtm=ancient("results/{scene}/dtm.tif"),
-        sections=ancient("results/{scene}/stitched/sections.parquet"),
-        corners=ancient("results/{scene}/stitched/corners.parquet"),
-        model=ancient("results/{scene}/models/corners.json"),
+        scene=given("results/{scene}/scene.json"),
+        dtm=given("results/{scene}/dtm.tif"),
+        sections=given("results/{scene}/stitched/sections.parquet"),
+        corners=given("results/{scene}/stitched/corners.parquet"),
+        model=given("results/{scene}/models/corners.json"),
     output:
         planes="results/{scene}/blocks/{block}/planes.parquet",
         filed="results/{scene}/blocks/{block}/filed_corners.parquet",
@@ -26,12 +29,15 @@ rule planes:
         " --planes {output.planes:q} --filed {output.filed:q} > {log:q} 2>&1"
 
 
+given = inputs("planes", "results/{scene}/blocks/{block}/ground.parquet")
+
+
 rule ground:
     """Move the sections of one block to where they stand."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        dtm=ancient("results/{scene}/dtm.tif"),
-        planes=ancient("results/{scene}/blocks/{block}/planes.parquet"),
+        scene=given("results/{scene}/scene.json"),
+        dtm=given("results/{scene}/dtm.tif"),
+        planes=given("results/{scene}/blocks/{block}/planes.parquet"),
     output:
         "results/{scene}/blocks/{block}/ground.parquet",
     log:
@@ -44,15 +50,16 @@ rule ground:
         "python -m kibs_steps.ground --scene {input.scene:q} --planes {input.planes:q} --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("buildings", "results/{scene}/buildings.parquet")
+
+
 rule buildings:
     """Group the sections of all blocks to buildings."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        ground=blocks("ground.parquet"),
-        footprints=lambda w: (
-            ancient(plan(w).settings["footprints"])
-            if "footprints" in plan(w).settings
-            else []
+        scene=given("results/{scene}/scene.json"),
+        ground=given(blocks("ground.parquet")),
+        footprints=given(
+            lambda w: [f for f in [plan(w).settings.get("footprints")] if f]
         ),
     output:
         "results/{scene}/buildings.parquet",
@@ -70,12 +77,15 @@ rule buildings:
         " --ground {input.ground:q} --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("solids", "results/{scene}/blocks/{block}/solids.city.jsonl")
+
+
 rule solids:
     """Build valid solids of the buildings of one block."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        dtm=ancient("results/{scene}/dtm.tif"),
-        buildings=ancient("results/{scene}/buildings.parquet"),
+        scene=given("results/{scene}/scene.json"),
+        dtm=given("results/{scene}/dtm.tif"),
+        buildings=given("results/{scene}/buildings.parquet"),
     output:
         solids="results/{scene}/blocks/{block}/solids.city.jsonl",
         attributes="results/{scene}/blocks/{block}/solids.parquet",

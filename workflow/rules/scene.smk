@@ -25,11 +25,14 @@ rule simulated:
         " --out $(dirname {output.raster:q}) > {log:q} 2>&1"
 
 
+given = inputs("scene", "results/{scene}/scene.json")
+
+
 rule scene:
     """Check the raster and the terrain once, and write what every later step needs to know."""
     input:
-        raster=lambda w: ancient(plan(w).raster),
-        dtm=lambda w: ancient(plan(w).terrain_files),
+        raster=given(lambda w: plan(w).raster),
+        dtm=given(lambda w: plan(w).terrain_files),
     output:
         scene="results/{scene}/scene.json",
         dtm="results/{scene}/dtm.tif",
@@ -56,11 +59,14 @@ rule scene:
         " --gsd {params.gsd} {params.options:q} --out {output.scene:q} > {log:q} 2>&1"
 
 
+given = inputs("tiles", "results/{scene}/blocks/{block}/tiles.tif")
+
+
 rule tiles:
     """The image of one block on the models' grid, margins included."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        raster=lambda w: ancient(plan(w).raster),
+        scene=given("results/{scene}/scene.json"),
+        raster=given(lambda w: plan(w).raster),
     output:
         "results/{scene}/blocks/{block}/tiles.tif",
     log:
@@ -75,11 +81,13 @@ rule tiles:
         " --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("model_{task}", "results/{scene}/models/{task}.json")
+
+
 rule model:
-    """Check a model's contract and angles, and write its hash down."""
+    """Check a model's contract, and write it down with the file's hash."""
     input:
-        scene=ancient("results/{scene}/scene.json"),
-        model=lambda w: ancient(str(plan(w).models[w.task].path)),
+        given(lambda w: str(plan(w).models[w.task].path)),
     output:
         "results/{scene}/models/{task}.json",
     log:
@@ -88,7 +96,5 @@ rule model:
         RUN
     params:
         signature=signature("model_{task}"),
-        allow=lambda w: ["--allow-angles"] if plan(w).settings["allow_angles"] else [],
     shell:
-        "python -m kibs_steps.models.contract {input.model:q} --task {wildcards.task} --scene {input.scene:q}"
-        " {params.allow:q} --out {output:q} > {log:q} 2>&1"
+        "python -m kibs_steps.models.contract {input:q} --task {wildcards.task} --out {output:q} > {log:q} 2>&1"
