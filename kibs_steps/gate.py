@@ -21,6 +21,7 @@ Rings = Sequence[Sequence[Point3]]
 
 PLANARITY = 5.0  # mm, from the Newell and from the fitted plane
 NEAR = 5.0  # mm, closest two vertices may be
+TOUCH = 2.0  # mm, a vertex this near to a face that does not have it touches it
 PAIRS_AT_ONCE = 4_000_000  # edge-face pairs held in memory
 
 
@@ -209,8 +210,8 @@ def _intersections(faces: Sequence[Rings], flat: Sequence[Flat]) -> list[Problem
         away[member[part]] = 0.0
 
         inside = ((xyz >= low[part, None]) & (xyz <= high[part, None])).all(axis=2)
-        f, v = np.nonzero(~member[part] & (np.abs(away) <= NEAR) & inside)
-        on = shapely.distance(polygons[first + f], _points_in(xyz[v], axes[first + f])) < NEAR
+        f, v = np.nonzero(~member[part] & (np.abs(away) <= TOUCH) & inside)
+        on = shapely.distance(polygons[first + f], _points_in(xyz[v], axes[first + f])) < TOUCH
         problems += [
             Problem("touch", (first + int(i),), f"vertex {points[k]} lies on face {first + i}, which does not have it")
             for i, k in zip(f[on], v[on], strict=True)

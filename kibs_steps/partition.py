@@ -78,8 +78,8 @@ def partition(
     if not faces:
         raise NoPartition("no section is wide enough to stand")
     if exact:
-        return Partition(straightened(_clear(_contracted(faces, 2 * EXACT)), STRAIGHT), True)
-    return Partition(_clear(_regular(faces, NOISE)), False)
+        return Partition(straightened(tidied(faces), STRAIGHT), True)
+    return Partition(tidied(_regular(faces, NOISE)), False)
 
 
 def polygonal(geometry: shapely.Geometry | None) -> shapely.Geometry:
@@ -430,6 +430,11 @@ def _meeting_points(
     for i, j, at in zip(e[keep], c[keep], t[keep], strict=True):
         points[int(i)].append((float(at), int(j)))
     return {i: [centres[j] for _, j in sorted(found)] for i, found in points.items()}
+
+
+def tidied(faces: list[Face]) -> list[Face]:
+    """Faces without edges too short, or vertices too near to an edge, for the millimetre grid."""
+    return _contracted(_clear(_contracted(faces, 2 * EXACT)), 2 * EXACT)
 
 
 def _clear(faces: list[Face]) -> list[Face]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kibs_steps.partition import MM, Face, Point, directed_edges, is_coverage
+from kibs_steps.partition import MM, Face, Point, directed_edges, is_coverage, tidied
 
 SLOPE_CAP = 75.0  # deg
 PLACE = 0.35  # m, σ of a vertex's place where sections did not fit
@@ -149,7 +149,7 @@ def drawn_to_planes(faces: list[Face], planes: np.ndarray) -> list[Face]:
         way *= min(1.0, FARTHEST / max(np.hypot(*way), 1e-9))
         moved[point] = (round(point[0] + way[0] * MM), round(point[1] + way[1] * MM))
     drawn = [Face(f.section, [[moved.get(p, p) for p in ring] for ring in f.rings]) for f in faces]
-    return drawn if is_coverage(drawn) else faces
+    return tidied(drawn) if is_coverage(drawn) else faces
 
 
 def _agreements(

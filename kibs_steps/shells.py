@@ -18,7 +18,7 @@ import numpy as np
 
 from kibs_steps.partition import MM, Face, NoPartition, Point, directed_edges, merged, regions, rings_along
 
-SAME = 5  # mm, levels of a column this near are one
+SAME = 8  # mm, levels of a column this near are one
 CHAMFER = 200.0  # mm, cut off a face where high and low alternate
 ROOF, WALL, GROUND = "RoofSurface", "WallSurface", "GroundSurface"
 
