@@ -27,9 +27,15 @@ BLOCKS = {  # block length and depth, road width: least and most (m)
     "desert": (50, 110, 30, 60, 4, 10),
     "estate": (90, 200, 70, 130, 6, 12),
     "mixed": (60, 130, 50, 90, 5, 14),
+    "town": (70, 150, 45, 85, 5, 10),
+}
+MIXTURES = {  # shares of the styles; a town is detached houses and rows, some old core, some works
+    "mixed": (0.2, 0.17, 0.12, 0.15, 0.1, 0.11, 0.04, 0.05, 0.06),
+    "town": (0.46, 0.26, 0.14, 0.0, 0.0, 0.1, 0.04, 0.0, 0.0),
 }
 NATIVE = {  # where a style is at home; elsewhere now and then
     "rows": ("holland", "britain", "north_france", "germany"),
+    "town": ("north_france", "germany"),
     "village": ("north_france", "germany", "mediterranean", "scandinavia"),
     "perimeter": ("paris", "germany", "mediterranean", "north_france", "scandinavia", "holland"),
     "desert": ("desert", "desert", "mediterranean"),
@@ -44,7 +50,7 @@ def procedural(
     style: str,
     origin: tuple[float, float] = (0.0, 0.0),
 ) -> City:
-    """A city of one of `STYLES` (or "mixed") over `width`×`height` m whose lower-left corner is `origin` (map metres)."""
+    """A city of one of `STYLES` or `MIXTURES` over `width`×`height` m whose lower-left corner is `origin` (map metres)."""
     area = (origin[0], origin[1], origin[0] + width, origin[1] + height)
     native = NATIVE.get(style)
     country = pick(rng, native) if native and rng.random() < 0.75 else None
@@ -78,8 +84,8 @@ def procedural(
             if np.hypot(x - site.middle[0], y - site.middle[1]) > corner + 25:
                 continue
             name = style
-            if style == "mixed":
-                name = str(rng.choice(STYLES, p=[0.2, 0.17, 0.12, 0.15, 0.1, 0.11, 0.04, 0.05, 0.06]))
+            if style in MIXTURES:
+                name = str(rng.choice(STYLES, p=MIXTURES[style]))
             elif rng.random() < 0.1:
                 name = pick(rng, STYLES)
             blocks.FILL["park" if rng.random() < green else name](site, s0, t0, s1, t1)

@@ -23,7 +23,7 @@ from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction, convergence
 from kibs_steps.simulate import camera, light
-from kibs_steps.simulate.city import STYLES, procedural
+from kibs_steps.simulate.city import MIXTURES, STYLES, procedural
 from kibs_steps.simulate.site import CLUTTER, ROOF, City
 from kibs_steps.terrain import Terrain, flat
 
@@ -540,7 +540,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--view-elevation", type=float, default=59.3, help="degrees above the horizon")
     parser.add_argument("--sun-azimuth", type=float, default=155.0)
     parser.add_argument("--sun-elevation", type=float, default=45.0)
-    parser.add_argument("--style", choices=[*STYLES, "mixed"], default="mixed")
+    parser.add_argument("--style", choices=[*STYLES, *MIXTURES], default="mixed")
     parser.add_argument("--relief", type=float, default=0.0, help="amplitude of the terrain's waves in metres")
     parser.add_argument("--slope", type=float, default=0.0, help="slope of the terrain in percent")
     parser.add_argument("--crs", default="EPSG:32631", help="a projected CRS in metres")

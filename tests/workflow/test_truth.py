@@ -52,6 +52,8 @@ def test_truth_in_truth_out(tmp_path, slope):
                 plan, z = np.hypot(gap[..., 0], gap[..., 1]), gap[..., 2]
                 best = min(best, np.where((plan < tolerance) & (z < 0.05), 0.0, plan + z).min(axis=1).max())
             matched += best == 0.0
-        assert matched == len(whole), f"{layer}: {len(whole) - matched} of {len(whole)} sections are not where they were"
+        assert matched == len(whole), (
+            f"{layer}: {len(whole) - matched} of {len(whole)} sections are not where they were"
+        )
     evaluation = json.loads((folder / "evaluation.json").read_text())
     assert evaluation
