@@ -75,23 +75,32 @@ def options(*keys):
     return tokens
 
 
-def inputs(step, output):
-    """How a rule with that step's signature and (first) output takes its inputs: `given = inputs(...); given(path)`.
+def inputs(step, *outputs):
+    """How a rule with that step's signature and these outputs takes its inputs: `given = inputs(...); given(path)`.
 
-    While the output was made under the present signature, nothing that happens to its inputs concerns it (a neighbouring
-    block made again gives the same bytes), so they are `ancient`. Otherwise they are plain inputs, and what makes them
-    again makes the output again.
+    While all outputs were made under the present signature, nothing that happens to their inputs concerns them (a
+    neighbouring block made again gives the same bytes): inputs are `ancient` then, and those that are gone are not asked
+    for. Otherwise they are plain inputs, and what makes them again makes the outputs again.
     """
+
+    def made(path, wanted):
+        return Path(path).exists() and wanted in (
+            workflow.persistence.params(IOFile(path)) or []
+        )
 
     def given(files):
         def choose(wildcards):
             found = files(wildcards) if callable(files) else files.format(**wildcards)
-            path = output.format(**wildcards)
-            recorded = workflow.persistence.params(IOFile(path)) or []
-            current = (
-                Path(path).exists() and repr(signature(step)(wildcards)) in recorded
+            wanted = repr(signature(step)(wildcards))
+            if not all(made(output.format(**wildcards), wanted) for output in outputs):
+                return found
+            return ancient(
+                [
+                    f
+                    for f in ([found] if isinstance(found, str) else found)
+                    if Path(f).exists()
+                ]
             )
-            return ancient(found) if current else found
 
         return choose
 

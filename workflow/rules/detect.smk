@@ -1,7 +1,13 @@
 # Sections and corners of every block, by the models or from the truth, and their union over the seams.
 
 
-given = inputs("sections", "results/{scene}/blocks/{block}/sections.tif")
+given = inputs(
+    "sections",
+    "results/{scene}/blocks/{block}/sections.tif",
+    "results/{scene}/blocks/{block}/detected/pieces.parquet",
+    "results/{scene}/blocks/{block}/detected/links.parquet",
+    "results/{scene}/blocks/{block}/detected/seams.npz",
+)
 
 
 rule sections:
@@ -98,7 +104,13 @@ rule truth:
         " --z {params.z} --out {output:q} > {log:q} 2>&1"
 
 
-given = inputs("feed", "results/{scene}/blocks/{block}/fed/pieces.parquet")
+given = inputs(
+    "feed",
+    "results/{scene}/blocks/{block}/fed/pieces.parquet",
+    "results/{scene}/blocks/{block}/fed/links.parquet",
+    "results/{scene}/blocks/{block}/fed/seams.npz",
+    "results/{scene}/blocks/{block}/fed/corners.parquet",
+)
 
 
 rule feed:
@@ -138,7 +150,11 @@ def detections(wildcards):
     ]
 
 
-given = inputs("stitch", "results/{scene}/stitched/sections.parquet")
+given = inputs(
+    "stitch",
+    "results/{scene}/stitched/sections.parquet",
+    "results/{scene}/stitched/corners.parquet",
+)
 
 
 rule stitch:

@@ -1,7 +1,9 @@
 # Comparison with truth, where a scene has it.
 
 
-given = inputs("evaluate", "results/{scene}/evaluation.json")
+given = inputs(
+    "evaluate", "results/{scene}/evaluation.json", "results/{scene}/evaluation.png"
+)
 
 
 rule evaluation:

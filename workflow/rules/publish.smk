@@ -53,7 +53,9 @@ rule geopackage:
         " --out {output:q} > {log:q} 2>&1"
 
 
-given = inputs("solids", "results/{scene}/city.city.json")
+given = inputs(
+    "solids", "results/{scene}/city.city.json", "results/{scene}/city.city.jsonl"
+)
 
 
 rule cityjson:
@@ -94,7 +96,7 @@ rule points:
         "python -m kibs_steps.publish.points --sections {input:q} --out {output:q} > {log:q} 2>&1"
 
 
-given = inputs("buildings", "results/{scene}/labels.tif")
+given = inputs("buildings", "results/{scene}/labels.tif", "results/{scene}/heights.tif")
 
 
 rule rasters:

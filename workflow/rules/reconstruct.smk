@@ -1,7 +1,11 @@
 # From sections and corners to planes, to where roofs stand, to buildings and solids.
 
 
-given = inputs("planes", "results/{scene}/blocks/{block}/planes.parquet")
+given = inputs(
+    "planes",
+    "results/{scene}/blocks/{block}/planes.parquet",
+    "results/{scene}/blocks/{block}/filed_corners.parquet",
+)
 
 
 rule planes:
@@ -77,7 +81,11 @@ rule buildings:
         " --ground {input.ground:q} --out {output:q} > {log:q} 2>&1"
 
 
-given = inputs("solids", "results/{scene}/blocks/{block}/solids.city.jsonl")
+given = inputs(
+    "solids",
+    "results/{scene}/blocks/{block}/solids.city.jsonl",
+    "results/{scene}/blocks/{block}/solids.parquet",
+)
 
 
 rule solids:

@@ -25,7 +25,7 @@ rule simulated:
         " --out $(dirname {output.raster:q}) > {log:q} 2>&1"
 
 
-given = inputs("scene", "results/{scene}/scene.json")
+given = inputs("scene", "results/{scene}/scene.json", "results/{scene}/dtm.tif")
 
 
 rule scene:
