@@ -58,10 +58,11 @@ def run(folder: Path, *flags: str, cores: int = 2, **settings: object) -> str:
 
 
 def jobs(output: str) -> dict[str, int]:
-    """How many jobs of each rule an output tells of."""
+    """How many jobs of each rule an output tells of, but for the target itself."""
     found: dict[str, int] = {}
     for rule in re.findall(r"^(?:localrule|rule) (\w+):", output, re.M):
         found[rule] = found.get(rule, 0) + 1
+    found.pop("all", None)
     return found
 
 
