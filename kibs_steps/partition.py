@@ -2,48 +2,33 @@
 
 In: one polygon per section (map frame, metres from the building's own origin) and the section's plane. Sections come from
 independent fits and a shift along the view ray by their own height, so neighbours overlap or gape by up to a metre.
-Out: a list of `Face`, polygons of integer millimetres that tile the building without gap, overlap or sliver: wherever two
-faces meet, both have the same vertices.
+Out: `faces.Face`s that tile the building without gap, overlap or sliver.
 
 Sections that already fit (to `EXACT`) keep every vertex. Otherwise vertices that neighbours mean to share are brought together,
 what is claimed twice goes to the higher roof (the lower one runs under it) or, at one height, to the smaller section, and what
-nobody claims between sections goes to the neighbour with the longest edge on it, the lower one at a step: that roof is what the
-higher one hid. Then edges shorter than the noise are contracted.
+nobody claims between sections goes to the neighbour with the longest edge on it, the lower one at a step: that roof is what
+the higher one hid.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from itertools import pairwise
-from math import atan2, hypot, pi
+from collections.abc import Callable, Sequence
+from math import hypot
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
-from kibs_steps.errors import KibsError
+from kibs_steps.faces import MM, Face, NoPartition, Point, directed_edges, merged, polygon, rings_of
 
-MM = 1000
 EXACT = 0.005  # m, sections that fit better than this are left alone
 REACH = 1.0  # m, vertices and edges that neighbours mean to share may be this far apart
 GAP = 1.5  # m
-NOISE = 0.35  # m, shortest edge worth keeping where sections do not fit
 STEP = 0.6  # m, roofs this far apart in height are taken for two levels
 SMALLEST = 0.5  # m², faces smaller than this are given to a neighbour
-CLEARANCE = 0.02  # m, a vertex this near to an edge is made part of it
-STRAIGHT = 0.002  # m, a vertex this near to the line between its neighbours says nothing
-
-Point = tuple[int, int]
-Ring = list[Point]
-
-
-class Face(NamedTuple):
-    """A connected part of one section: its index, and rings of mm points, the exterior counter-clockwise first."""
-
-    section: int
-    rings: list[Ring]
+THIN = 0.3  # m, so are narrower ones
 
 
 class Partition(NamedTuple):
@@ -51,10 +36,6 @@ class Partition(NamedTuple):
 
     faces: list[Face]
     exact: bool
-
-
-class NoPartition(KibsError):
-    """Sections that cannot be made into a partition."""
 
 
 def partition(
@@ -77,9 +58,7 @@ def partition(
         faces, _ = _tile(cleaned, planes, reliable, REACH, gap)
     if not faces:
         raise NoPartition("no section is wide enough to stand")
-    if exact:
-        return Partition(straightened(tidied(faces), STRAIGHT), True)
-    return Partition(tidied(_regular(faces, NOISE)), False)
+    return Partition(faces, exact)
 
 
 def polygonal(geometry: shapely.Geometry | None) -> shapely.Geometry:
@@ -93,116 +72,6 @@ def polygonal(geometry: shapely.Geometry | None) -> shapely.Geometry:
         flat = shapely.make_valid(flat, method="structure", keep_collapsed=False)
     parts = [p for p in shapely.get_parts(flat) if p.geom_type == "Polygon" and not p.is_empty]
     return shapely.set_precision(shapely.union_all(parts), 1 / MM) if parts else shapely.Polygon()
-
-
-def polygon(face: Face) -> shapely.Polygon:
-    """A face as a polygon of metres."""
-    exterior, *holes = [np.asarray(ring, float) / MM for ring in face.rings]
-    return shapely.Polygon(exterior, holes)
-
-
-def directed_edges(faces: Iterable[Face]) -> dict[tuple[Point, Point], int]:
-    """Which face lies on the left of each directed edge. Raises `NoPartition` where two do."""
-    edges: dict[tuple[Point, Point], int] = {}
-    for f, face in enumerate(faces):
-        for ring in face.rings:
-            for edge in zip(ring, [*ring[1:], ring[0]], strict=True):
-                if edge in edges:
-                    raise NoPartition(f"two sections claim the same side of the edge {edge}")
-                edges[edge] = f
-    return edges
-
-
-def rings_along(edges: Iterable[tuple[Point, Point]]) -> list[Ring]:
-    """Chain directed edges (area on their left) into rings; where a region touches itself, rings keep to their own corner."""
-    leaving: dict[Point, list[Point]] = defaultdict(list)
-    for u, v in sorted(edges):
-        leaving[u].append(v)
-    rings = []
-    for start in sorted(leaving):
-        while leaving[start]:
-            first = leaving[start].pop(0)
-            ring, before, at = [start], start, first
-            while True:
-                choices = [*leaving[at], first] if at == start else leaving[at]
-                if not choices:
-                    raise NoPartition(f"an outline ends at {at}")
-                following = min(choices, key=lambda p, at=at, before=before: _clockwise(at, before, p))
-                if at == start and following == first:
-                    break
-                ring.append(at)
-                leaving[at].remove(following)
-                before, at = at, following
-            rings.append(ring)
-    return rings
-
-
-def _clockwise(at: Point, reference: Point, other: Point) -> float:
-    """Angle (0, 2π] turned clockwise at `at` from the direction of `reference` to that of `other`."""
-    first = atan2(reference[1] - at[1], reference[0] - at[0])
-    second = atan2(other[1] - at[1], other[0] - at[0])
-    return (first - second) % (2 * pi) or 2 * pi
-
-
-def area(ring: Ring) -> float:
-    """Signed area (mm²), positive counter-clockwise."""
-    return sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(ring, [*ring[1:], ring[0]], strict=True)) / 2
-
-
-def regions(rings: list[Ring]) -> list[list[Ring]]:
-    """Group rings into exteriors, each followed by the holes inside it."""
-    exteriors = [r for r in rings if area(r) > 0]
-    grouped = [[r] for r in exteriors]
-    if len(exteriors) == 1:
-        grouped[0] += [r for r in rings if area(r) < 0]
-        return grouped
-    solid = [shapely.Polygon(r) for r in exteriors]
-    for hole in (r for r in rings if area(r) < 0):
-        inside = shapely.Polygon(hole).representative_point()
-        around = [k for k, p in enumerate(solid) if p.contains(inside)]
-        if around:
-            grouped[min(around, key=lambda k: solid[k].area)].append(hole)
-    return grouped
-
-
-def merged(faces: list[Face], label: Callable[[int], int | None]) -> list[Face]:
-    """Faces joined across edges where their `label` is the same; those labelled None are dropped."""
-    edges = directed_edges(faces)
-    labels = [label(f) for f in range(len(faces))]
-    neighbours: dict[int, set[int]] = defaultdict(set)
-    for (u, v), f in edges.items():
-        g = edges.get((v, u))
-        if g is not None and labels[g] == labels[f]:
-            neighbours[f].add(g)
-    outlines: dict[int, list[tuple[Point, Point]]] = defaultdict(list)
-    group = _components(len(faces), neighbours)
-    for (u, v), f in edges.items():
-        g = edges.get((v, u))
-        if g is None or group[g] != group[f]:
-            outlines[group[f]].append((u, v))
-    joined = []
-    for f in sorted(outlines):
-        if labels[f] is not None:
-            joined += [Face(labels[f], region) for region in regions(rings_along(outlines[f]))]
-    return joined
-
-
-def dissolved(faces: list[Face]) -> list[Face]:
-    """The whole building as one face per connected part, all of section 0."""
-    return straightened(merged(faces, lambda f: 0), STRAIGHT)
-
-
-def _components(n: int, neighbours: dict[int, set[int]]) -> list[int]:
-    """For each of n nodes the smallest node it is connected to."""
-    component = [-1] * n
-    for start in range(n):
-        waiting = [start] if component[start] < 0 else []
-        while waiting:
-            node = waiting.pop()
-            if component[node] < 0:
-                component[node] = start
-                waiting += neighbours.get(node, ())
-    return component
 
 
 def _tile(
@@ -242,19 +111,11 @@ def _tile(
             labels.append(claim[0] if claim else None)
     misfit = (np.array([len(c) for c in claims]) != 1) & (narrow | in_slit)
     visible = misfit & ~shapely.is_empty(shapely.buffer(cells, -EXACT, quad_segs=1))
-    faces = [Face(k, _rings_of(cell)) for k, cell in enumerate(cells)]
+    faces = [Face(k, rings_of(cell)) for k, cell in enumerate(cells)]
     gaps = {k for k in np.flatnonzero(misfit) if labels[k] is None}
     labels = _give_away(faces, labels, gaps, lambda k, s: float(planes[s] @ (*xy[k], 1.0)))
     faces = merged(faces, lambda f: labels[f])
-    return _without_slivers(faces, 2 * EXACT if reach == EXACT else 0.3), not visible.any()
-
-
-def _rings_of(cell: shapely.Polygon) -> list[Ring]:
-    """A polygon's rings as mm points."""
-    return [
-        [(int(x), int(y)) for x, y in np.rint(shapely.get_coordinates(ring)[:-1] * MM)]
-        for ring in (cell.exterior, *cell.interiors)
-    ]
+    return _without_slivers(faces, 2 * EXACT if reach == EXACT else THIN), not visible.any()
 
 
 def _slits(polygons: list[shapely.Geometry], width: float) -> np.ndarray:
@@ -430,140 +291,3 @@ def _meeting_points(
     for i, j, at in zip(e[keep], c[keep], t[keep], strict=True):
         points[int(i)].append((float(at), int(j)))
     return {i: [centres[j] for _, j in sorted(found)] for i, found in points.items()}
-
-
-def tidied(faces: list[Face]) -> list[Face]:
-    """Faces without edges too short, or vertices too near to an edge, for the millimetre grid."""
-    return _contracted(_clear(_contracted(faces, 2 * EXACT)), 2 * EXACT)
-
-
-def _clear(faces: list[Face]) -> list[Face]:
-    """Faces whose edges pass through every vertex nearer than `CLEARANCE`, so that nothing almost touches."""
-    edges = sorted({(min(e), max(e)) for e in directed_edges(faces)})
-    points = sorted({p for e in edges for p in e})
-    ends, at = np.array(edges, float), np.array(points, float)
-    e, p = shapely.STRtree(shapely.points(at)).query(shapely.linestrings(ends), "dwithin", CLEARANCE * MM)
-    span = ends[e, 1] - ends[e, 0]
-    t = ((at[p] - ends[e, 0]) * span).sum(axis=1) / (span**2).sum(axis=1)
-    through: dict[tuple[Point, Point], list[tuple[float, Point]]] = defaultdict(list)
-    for i, k, along in zip(e, p, t, strict=True):
-        if points[k] not in edges[i] and 0 < along < 1:
-            through[edges[i]].append((float(along), points[k]))
-    if not through:
-        return faces
-
-    def path(u: Point, v: Point) -> list[Point]:
-        between = [q for _, q in sorted(through.get((min(u, v), max(u, v)), []))]
-        return [u, *(between if u < v else between[::-1])]
-
-    denser = []
-    try:
-        for face in faces:
-            own = {
-                e
-                for r in face.rings
-                for u, v in zip(r, [*r[1:], r[0]], strict=True)
-                for e in pairwise([*path(u, v), v])
-            }
-            open_edges = [(u, v) for u, v in own if (v, u) not in own]  # spikes and slits of the face have closed
-            denser += [Face(face.section, region) for region in regions(rings_along(open_edges))]
-        directed_edges(denser)
-    except NoPartition:
-        return faces
-    return denser
-
-
-def straightened(faces: list[Face], tolerance: float) -> list[Face]:
-    """Faces without the vertices that lie within `tolerance` (m) of the line between their only two neighbours."""
-    while True:
-        around: dict[Point, set[Point]] = defaultdict(set)
-        fewest: dict[Point, int] = {}
-        for face in faces:
-            for ring in face.rings:
-                for before, point, after in zip([ring[-1], *ring[:-1]], ring, [*ring[1:], ring[0]], strict=True):
-                    around[point] |= {before, after}
-                    fewest[point] = min(fewest.get(point, len(ring)), len(ring))
-        dropped: set[Point] = set()
-        for point in sorted(around):
-            if len(around[point]) == 2 and fewest[point] > 3 and not around[point] & dropped:
-                a, b = around[point]
-                if _off_line(point, a, b) <= tolerance * MM:
-                    dropped.add(point)
-        slimmer = [Face(f.section, [[p for p in r if p not in dropped] for r in f.rings]) for f in faces]
-        if not dropped or any(len(r) < 3 for f in slimmer for r in f.rings):
-            return faces
-        faces = slimmer
-
-
-def _off_line(point: Point, a: Point, b: Point) -> float:
-    """Distance of `point` from the segment a–b; infinite beyond its ends."""
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    length = hypot(dx, dy)
-    px, py = point[0] - a[0], point[1] - a[1]
-    return abs(dx * py - dy * px) / length if length and 0 < dx * px + dy * py < length**2 else float("inf")
-
-
-def _regular(faces: list[Face], noise: float) -> list[Face]:
-    """Faces simplified on their shared edges to `noise` (m), none of the steps leaving a valid coverage."""
-    shapes = [polygon(f) for f in faces]
-    if not shapely.coverage_is_valid(shapes) or not shapely.is_valid(shapes).all():
-        return straightened(faces, STRAIGHT)
-    simple = shapely.orient_polygons(shapely.coverage_simplify(np.array(shapes, object), noise))
-    simpler = [Face(f.section, _rings_of(p)) for f, p in zip(faces, simple, strict=True) if not p.is_empty]
-    if is_coverage(simpler):
-        faces = simpler
-    contracted = straightened(_contracted(faces, noise), noise / 5)
-    return contracted if is_coverage(contracted) else straightened(faces, STRAIGHT)
-
-
-def is_coverage(faces: list[Face]) -> bool:
-    """Whether faces are valid polygons that tile without overlap."""
-    if any(len(set(r)) < len(r) or len(r) < 3 for f in faces for r in f.rings):
-        return False
-    shapes = [polygon(f) for f in faces]
-    return bool(shapely.is_valid(shapes).all() and shapely.coverage_is_valid(shapes))
-
-
-def _contracted(faces: list[Face], shortest: float) -> list[Face]:
-    """Faces whose edges below `shortest` (m) are drawn together to their middle, shortest first, while all stay simple."""
-    refused: set[tuple[Point, Point]] = set()
-    while True:
-        at: dict[Point, set[int]] = defaultdict(set)
-        edges = set()
-        for f, face in enumerate(faces):
-            for ring in face.rings:
-                for u, v in zip(ring, [*ring[1:], ring[0]], strict=True):
-                    at[u].add(f)
-                    edges.add((min(u, v), max(u, v)))
-        short = [(hypot(v[0] - u[0], v[1] - u[1]), u, v) for u, v in edges - refused]
-        short = sorted(s for s in short if s[0] < shortest * MM)
-        if not short:
-            return faces
-        _, u, v = short[0]
-        middle = ((u[0] + v[0]) // 2, (u[1] + v[1]) // 2)
-        touched = sorted(at[u] | at[v])
-        drawn = [_drawn_together(faces[f], u, v, middle) for f in touched]
-        if (middle in at and middle not in (u, v)) or not _all_simple(drawn):
-            refused.add((u, v))
-            continue
-        faces = list(faces)
-        for f, face in zip(touched, drawn, strict=True):
-            faces[f] = face
-
-
-def _drawn_together(face: Face, u: Point, v: Point, middle: Point) -> Face:
-    """The face with two of its points made one."""
-    rings = []
-    for ring in face.rings:
-        new = [middle if p in (u, v) else p for p in ring]
-        rings.append([p for k, p in enumerate(new) if p != new[k - 1]])
-    return Face(face.section, rings)
-
-
-def _all_simple(faces: list[Face]) -> bool:
-    """Whether each face is a valid polygon, counter-clockwise, of more than `SMALLEST` / 2."""
-    if any(len(r) < 3 or len(set(r)) < len(r) for f in faces for r in f.rings):
-        return False
-    if any(area(f.rings[0]) < SMALLEST / 2 * MM**2 for f in faces):
-        return False
-    return bool(shapely.is_valid([polygon(f) for f in faces]).all())

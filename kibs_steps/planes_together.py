@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kibs_steps.partition import MM, Face, Point, directed_edges, is_coverage, tidied
+from kibs_steps.faces import MM, Face, Point, directed_edges, is_coverage
+from kibs_steps.straight import tidied
 
 SLOPE_CAP = 75.0  # deg
 PLACE = 0.35  # m, σ of a vertex's place where sections did not fit

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kibs_steps.partition import MM, Face, NoPartition, Point, directed_edges, merged, regions, rings_along
+from kibs_steps.faces import MM, Face, NoPartition, Point, directed_edges, merged, regions, rings_along
 
 SAME = 8  # mm, levels of a column this near are one
 CHAMFER = 200.0  # mm, cut off a face where high and low alternate

@@ -18,17 +18,19 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, gate, scene, shells, store
+from kibs_steps import cli, gate, scene, shells, store, straight
 from kibs_steps.buildings import hidden
 from kibs_steps.errors import KibsError
+from kibs_steps.faces import MM, Face, NoPartition, dissolved, polygon
 from kibs_steps.ground import slope_azimuth
-from kibs_steps.partition import GAP, MM, Face, NoPartition, dissolved, partition, polygon, polygonal
+from kibs_steps.partition import GAP, partition, polygonal
 from kibs_steps.planes_together import SLOPE_CAP, bring_together, drawn_to_planes
 from kibs_steps.shells import GROUND, ROOF, WALL, Surface
 from kibs_steps.terrain import Terrain
 
 FITTED = ("ok", "raster_edge", "cloud_or_nodata")  # statuses whose plane was fitted to enough corners
 LOWEST_ROOF = 0.5  # m above the building's ground
+RAGGED = 1.3  # px, how far the rim of a traced section may be from its straight edge
 ONE_LEVEL = 0.1  # m, flat sections this near in height are one level
 PITCHED = 5.0  # deg, from here on a section counts as a slope
 SAME_WAY = 25.0  # deg between azimuths
@@ -60,7 +62,10 @@ class Refused(KibsError):
 
 
 class Sections(NamedTuple):
-    """The sections of one building: ids, polygons and planes (n, 3: z = a·x + b·y + c) in metres from `origin` (map m)."""
+    """The sections of one building: ids, polygons and planes (n, 3: z = a·x + b·y + c) in metres from `origin` (map m).
+
+    `traced`: their outlines run from pixel corner to pixel corner, so their rims are ragged.
+    """
 
     ids: np.ndarray
     polygons: list[shapely.Geometry]
@@ -68,6 +73,7 @@ class Sections(NamedTuple):
     status: list[str]
     sigma: np.ndarray
     origin: tuple[int, int]
+    traced: bool = False
 
     @property
     def fitted(self) -> np.ndarray:
@@ -86,14 +92,19 @@ class Solid(NamedTuple):
     base: shapely.Geometry
 
 
-def build(sections: Sections, dtm: Terrain, lod_label: str = "2.0", gap: float = GAP) -> Solid:
-    """The most detailed valid solid of a building; never raises on geometry. `gap` (m) as in `partition`."""
+def build(
+    sections: Sections, dtm: Terrain, lod_label: str = "2.0", gap: float = GAP, reach: float = straight.REACH
+) -> Solid:
+    """The most detailed valid solid of a building; never raises on geometry.
+
+    `gap` (m) as in `partition.partition`, `reach` (m) as in `straight.ragged`.
+    """
     refused: list[str] = []
     try:
         faces, exact = partition(sections.polygons, sections.planes, sections.fitted, gap)
         planes = sections.planes
-        if not exact:
-            faces = drawn_to_planes(faces, planes)
+        as_it_is = exact and not sections.traced
+        faces = straight.tidied(faces) if as_it_is else drawn_to_planes(straight.ragged(faces, reach), planes)
     except CANNOT as error:
         refused.append(f"{lod_label} and 1.3: {error}")
         try:
@@ -125,7 +136,7 @@ def _ladder(
         yield lod_label, lambda: (faces, planes)
     if len(planes) == len(sections.ids):
         yield "1.3", lambda: (faces, _level_sections(faces, planes))
-    yield "1.2", lambda: (dissolved(faces), _one_level(faces, planes))
+    yield "1.2", lambda: (straight.tidied(dissolved(faces)), _one_level(faces, planes))
 
 
 def _gated(faces: list[Face], planes: np.ndarray, ground: int, ids: np.ndarray) -> list[list[Surface]]:
@@ -181,7 +192,8 @@ def _one_polygon(sections: Sections) -> tuple[list[Face], np.ndarray]:
     centre = shapely.get_coordinates([p.centroid if p.area else shapely.Point(0, 0) for p in shapes])
     mean = (sections.planes * np.c_[centre, np.ones(len(area))]).sum(axis=1)
     plane = np.array([[0.0, 0.0, float((area * mean).sum() / area.sum())]])
-    return partition([shapely.union_all(shapes)], plane, np.ones(1, bool)).faces, plane
+    faces = partition([shapely.union_all(shapes)], plane, np.ones(1, bool)).faces
+    return straight.tidied(faces), plane
 
 
 def _nothing(sections: Sections, dtm: Terrain, refused: list[str]) -> Solid:
@@ -279,6 +291,7 @@ def sections_of(table: pa.Table) -> Iterator[tuple[int, Sections]]:
     building = table["building_id"].to_numpy()
     ids = table["section_id"].to_numpy()
     outlines = shapely.from_wkb(table["outline_map"].to_numpy(zero_copy_only=False), on_invalid="ignore")
+    pixels = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False), on_invalid="ignore")
     status = table["status"].to_pylist()
     a, b, c, x0, y0, sigma = (
         table[name].to_numpy().astype(float) for name in ("plane_a", "plane_b", "plane_c", "x0", "y0", "height_sigma")
@@ -293,7 +306,9 @@ def sections_of(table: pa.Table) -> Iterator[tuple[int, Sections]]:
         planes = np.column_stack([a[mine], b[mine], local])
         near = [g and shapely.transform(shapely.force_2d(g), lambda xy, o=origin: xy - o) for g in outlines[mine]]
         place = (int(origin[0]), int(origin[1]))
-        yield int(building[first]), Sections(ids[mine], near, planes, status[mine], sigma[mine], place)
+        corners = shapely.get_coordinates(pixels[mine])
+        traced = bool(len(corners)) and bool((corners == np.round(corners)).all())
+        yield int(building[first]), Sections(ids[mine], near, planes, status[mine], sigma[mine], place, traced)
 
 
 def attributes(building: int, sections: Sections, solid: Solid, position_corrected: bool) -> dict[str, Any]:
@@ -421,7 +436,7 @@ def main(argv: list[str] | None = None) -> None:
     with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
         out.write(json.dumps(header(datum), separators=(",", ":")) + "\n")
         for building, sections in buildings:
-            solid = build(sections, dtm, args.lod_label, gap)
+            solid = build(sections, dtm, args.lod_label, gap, RAGGED * grid.gsd)
             row = attributes(building, sections, solid, facts.view is not None)
             line = feature(row, sections, solid, datum, convergence)
             out.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")

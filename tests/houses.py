@@ -132,7 +132,7 @@ def ground_table(
         wkb = shapely.to_wkb(outline, output_dimension=3)
         found = {
             "section_id": (ids or range(1, n + 1))[k],
-            "outline": wkb,
+            "outline": shapely.to_wkb(shapely.transform(outline, lambda p: (p - place) / 0.38)),
             "outline_seen": wkb,
             "outline_map": wkb,
             "status": (status or ["ok"] * n)[k],
