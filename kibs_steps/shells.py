@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kibs_steps.faces import MM, Face, NoPartition, Point, directed_edges, merged, regions, rings_along
+from kibs_steps.faces import MM, Face, NoPartition, Point, directed_edges, regions, rings_along
 
 SAME = 8  # mm, levels of a column this near are one
 CHAMFER = 200.0  # mm, cut off a face where high and low alternate
@@ -255,8 +255,3 @@ def _shell(faces: list[Face], planes: np.ndarray, ground: int) -> list[Surface]:
     for region in regions(base):
         surfaces.append(Surface(GROUND, -1, [[(*p, ground) for p in reversed(ring)] for ring in region], False))
     return surfaces
-
-
-def footprint(faces: list[Face]) -> list[Face]:
-    """The outline of each connected part as one face of section 0."""
-    return merged(faces, lambda f: 0)

@@ -100,61 +100,78 @@ def build(
     `gap` (m) as in `partition.partition`, `reach` (m) as in `straight.ragged`.
     """
     refused: list[str] = []
+    divided = True
+    planes = sections.planes
     try:
-        faces, exact = partition(sections.polygons, sections.planes, sections.fitted, gap)
-        planes = sections.planes
+        faces, exact = partition(sections.polygons, planes, sections.fitted, gap)
         as_it_is = exact and not sections.traced
         faces = straight.tidied(faces) if as_it_is else drawn_to_planes(straight.ragged(faces, reach), planes)
     except CANNOT as error:
         refused.append(f"{lod_label} and 1.3: {error}")
+        divided = False
         try:
             faces, planes = _one_polygon(sections)
         except CANNOT as worse:
             return _nothing(sections, dtm, [*refused, f"1.2: {worse}"])
-    fitted = len(planes) == len(sections.ids) and sections.fitted.any()
-    if len(planes) == len(sections.ids) and not fitted:
-        refused.append(f"{lod_label}: no section has a fitted plane")
     ground = lowest_ground(_shapes(faces), sections.origin, dtm)
     kind = roof_type(faces, planes)
-    for lod, roof in _ladder(faces, planes, sections, lod_label if fitted else None):
+    ladder: list[tuple[str, Callable[[], tuple[list[Face], np.ndarray]]]] = []
+    if divided and sections.fitted.any():
+        ladder += [
+            (lod_label, lambda: (faces, bring_together(faces, planes, sections.sigma, sections.fitted).planes)),
+            (lod_label, lambda: (faces, planes)),
+            (lod_label, lambda: (faces, _bad_ones_level(faces, planes, ground))),
+        ]
+    elif divided:
+        refused.append(f"{lod_label}: no section has a fitted plane")
+    if divided:
+        ladder.append(("1.3", lambda: (faces, _level_sections(faces, planes))))
+    ladder.append(("1.2", lambda: (straight.tidied(dissolved(faces)), _one_level(faces, planes))))
+    for lod, roof in ladder:
         try:
-            built = _gated(*roof(), ground, sections.ids)
+            built = _gated(*roof(), ground, sections.ids if lod != "1.2" else None)
         except (Refused, *CANNOT) as error:
             refused.append(f"{lod}: {error}")
         else:
-            reason = "" if lod == lod_label else "; ".join(dict.fromkeys(refused))
-            return Solid(lod, reason, built, ground, kind, _base(built, sections.origin))
+            return Solid(lod, "; ".join(dict.fromkeys(refused)), built, ground, kind, _base(built, sections.origin))
     return _nothing(sections, dtm, refused)
 
 
-def _ladder(
-    faces: list[Face], planes: np.ndarray, sections: Sections, lod_label: str | None
-) -> Iterator[tuple[str, Callable[[], tuple[list[Face], np.ndarray]]]]:
-    """What to try, best first: a level of detail and its faces and planes; `lod_label` None leaves LOD2 out."""
-    if lod_label is not None:
-        yield lod_label, lambda: (faces, bring_together(faces, planes, sections.sigma, sections.fitted).planes)
-        yield lod_label, lambda: (faces, planes)
-    if len(planes) == len(sections.ids):
-        yield "1.3", lambda: (faces, _level_sections(faces, planes))
-    yield "1.2", lambda: (straight.tidied(dissolved(faces)), _one_level(faces, planes))
+def _unusable(face: Face, plane: np.ndarray, ground: int) -> str | None:
+    """What is wrong with a roof face on its own: too steep, or too near to the ground."""
+    slope = float(np.degrees(np.arctan(np.hypot(plane[0], plane[1]))))
+    if slope > SLOPE_CAP:
+        return f"has a slope of {slope:.0f}°"
+    above = min(shells.height(plane, p) for ring in face.rings for p in ring) - ground
+    if above < LOWEST_ROOF * MM:
+        return f"comes down to {above / MM:.2f} m above the ground"
+    return None
 
 
-def _gated(faces: list[Face], planes: np.ndarray, ground: int, ids: np.ndarray) -> list[list[Surface]]:
-    """Shells that pass the gate. Raises `Refused` or `NoPartition`."""
-    steep = np.degrees(np.arctan(np.hypot(planes[:, 0], planes[:, 1])))
+def _gated(faces: list[Face], planes: np.ndarray, ground: int, ids: np.ndarray | None) -> list[list[Surface]]:
+    """Shells that pass the gate; `ids` None for a roof that is not divided. Raises `Refused` or `NoPartition`."""
     for face in faces:
-        name = f"section {ids[face.section]}" if len(planes) == len(ids) else "the roof"
-        if steep[face.section] > SLOPE_CAP:
-            raise Refused(f"{name} has a slope of {steep[face.section]:.0f}°")
-        above = min(shells.height(planes[face.section], p) for ring in face.rings for p in ring) - ground
-        if above < LOWEST_ROOF * MM:
-            raise Refused(f"{name} comes down to {above / MM:.2f} m above the ground")
+        wrong = _unusable(face, planes[face.section], ground)
+        if wrong:
+            raise Refused(f"{'the roof' if ids is None else f'section {ids[face.section]}'} {wrong}")
     built = shells.shells(faces, planes, ground)
     for shell in built:
         problems = gate.check([surface.rings for surface in shell])
         if problems:
             raise Refused(problems[0].text)
     return built
+
+
+def _bad_ones_level(faces: list[Face], planes: np.ndarray, ground: int) -> np.ndarray:
+    """Planes with those unusable on their own made level at their mean height, above ground. Raises `Refused` if all are."""
+    bad = {face.section for face in faces if _unusable(face, planes[face.section], ground)}
+    if not bad or bad == {face.section for face in faces}:
+        raise Refused("level planes in place of bad ones do not help")
+    _, mean = _mean_heights(faces, planes)
+    mended = planes.astype(float).copy()
+    for section in bad:
+        mended[section] = (0.0, 0.0, max(mean[section], ground / MM + LOWEST_ROOF))
+    return mended
 
 
 def _mean_heights(faces: list[Face], planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -43,6 +43,8 @@ COLLINEAR = 0.002  # m, a vertex this near to the line between its neighbours sa
 
 def ragged(faces: list[Face], reach: float = REACH) -> list[Face]:
     """Straight faces of ragged ones, rims moved by `reach` (m) at most; as they were where no straight version tiles."""
+    junctions = {point for point, others in _around(faces).items() if len(others) > 2}
+    faces = _contracted(faces, reach, junctions)
     faces = _straight(faces, reach) or faces
     shorter = without_collinear(_contracted(faces, NOISE), NOISE / 5)
     return tidied(shorter if is_coverage(shorter) else faces)
@@ -87,12 +89,18 @@ def _straight(faces: list[Face], reach: float) -> list[Face] | None:
     return None
 
 
-def _chains(faces: list[Face]) -> Iterator[list[Point]]:
-    """The edges of all faces as paths between junctions (vertices with other than two edges), each once; loops in two halves."""
+def _around(faces: list[Face]) -> dict[Point, list[Point]]:
+    """The vertices that each vertex has an edge to."""
     around: dict[Point, list[Point]] = defaultdict(list)
     for u, v in sorted({(min(e), max(e)) for e in directed_edges(faces)}):
         around[u].append(v)
         around[v].append(u)
+    return around
+
+
+def _chains(faces: list[Face]) -> Iterator[list[Point]]:
+    """The edges of all faces as paths between junctions (vertices with other than two edges), each once; loops in two halves."""
+    around = _around(faces)
     left = {(u, v) for u in around for v in around[u]}
 
     def follow(u: Point, v: Point) -> list[Point]:
@@ -222,8 +230,11 @@ def _clear(faces: list[Face]) -> list[Face]:
     return denser
 
 
-def _contracted(faces: list[Face], shortest: float) -> list[Face]:
-    """Faces whose edges below `shortest` (m) are drawn together to their middle, shortest first, while all stay simple."""
+def _contracted(faces: list[Face], shortest: float, among: set[Point] | None = None) -> list[Face]:
+    """Faces whose edges below `shortest` (m) are drawn together to their middle, shortest first, while all stay simple.
+
+    With `among`, only edges that join two of these points.
+    """
     faces = list(faces)
     refused: set[tuple[Point, Point]] = set()
     while True:
@@ -234,6 +245,8 @@ def _contracted(faces: list[Face], shortest: float) -> list[Face]:
                 for u, v in zip(ring, [*ring[1:], ring[0]], strict=True):
                     at[u].add(f)
                     length = hypot(v[0] - u[0], v[1] - u[1])
+                    if among is not None and not (u in among and v in among):
+                        continue
                     if length < shortest * MM and (min(u, v), max(u, v)) not in refused:
                         short.append((length, min(u, v), max(u, v)))
         if not short:

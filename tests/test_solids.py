@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from kibs_steps import gate, solids, store, terrain
 from kibs_steps.shells import GROUND, ROOF, WALL
+from kibs_steps.stitch import simplified
 
 FLAT = terrain.flat(0.0)
 
@@ -155,6 +156,15 @@ def test_a_roof_below_ground_falls_back_with_the_reason():
     assert shells_are_valid(solid)
 
 
+def test_one_section_that_dives_is_made_level_and_told():
+    house = [*houses.HIP, ([(14, 1), (22, 1), (22, 8), (14, 8)], (-0.8, 0, 17.0))]
+    _, solid, row = built(house)
+    assert row["lod"] == "2.0"
+    assert row["lod_reason"].startswith("2.0: section 5 comes down to")
+    assert row["volume"] == pytest.approx(houses.VOLUME["hip"] + 8 * 7 * 2.6, rel=1e-3)
+    assert shells_are_valid(solid)
+
+
 def test_a_roof_wholly_below_ground_stays_as_a_footprint():
     _, solid, row = built([(ring, (0, 0, -2.0)) for ring, _ in houses.BOX])
     assert (row["lod"], row["valid"], solid.shells) == ("0", False, [])
@@ -239,6 +249,36 @@ def test_any_polygon_beside_a_house_is_survived(ring, a, b):
     _, solid, row = built([(ring, (a, b, 6.0)), *houses.WITH_WING])
     assert shells_are_valid(solid)
     assert solid.lod == "2.0" or row["lod_reason"]
+
+
+def traced(house, gsd=0.38, degrees=17.0):
+    """The house as a label image gives it: outlines along pixel corners, smoothed by 1.5 px; planes exact."""
+    from affine import Affine
+    from rasterio.features import rasterize, shapes
+
+    house = houses.turned(house, degrees, (20.0, 20.0))
+    place = Affine(gsd, 0, 0, 0, -gsd, 60.0)
+    pieces = [(shapely.Polygon(ring), k + 1) for k, (ring, _) in enumerate(house)]
+    labels = rasterize(pieces, (160, 160), transform=place, dtype="int32")
+    found = [(int(v), shapely.geometry.shape(g)) for g, v in shapes(labels, mask=labels > 0)]
+    largest = [max((g for v, g in found if v == k + 1), key=shapely.area) for k in range(len(house))]
+    smooth = simplified(np.array(largest), 1.5)
+    sections = list(shapely.transform(smooth, lambda p: np.column_stack([p[:, 0] * gsd, 60.0 - p[:, 1] * gsd])))
+    planes = np.array([plane for _, plane in house])
+    n = len(house)
+    return solids.Sections(np.arange(1, n + 1), sections, planes, ["ok"] * n, np.full(n, 0.15), (0, 0), True)
+
+
+@pytest.mark.parametrize("name", ["box", "gable", "hip", "l_house", "with_wing", "courtyard"])
+def test_ragged_outlines_become_straight(name):
+    sections = traced(houses.HOUSES[name])
+    solid = solids.build(sections, FLAT)
+    assert solid.lod == "2.0"
+    exact = built(houses.HOUSES[name])[1]
+    walls = [sum(s.kind == WALL and s.exterior for shell in x.shells for s in shell) for x in (solid, exact)]
+    assert walls[0] <= walls[1] + 2
+    volumes = [sum(gate.volume([s.rings for s in shell]) for shell in x.shells) for x in (solid, exact)]
+    assert volumes[0] == pytest.approx(volumes[1], rel=0.05)
 
 
 def shares(height, outline, lean=(0.0, 0.0), n=4):
