@@ -27,7 +27,9 @@ def listed(name):
 
 @pytest.mark.parametrize(("env", "extra"), [("run", []), ("learn", PROJECT["optional-dependencies"]["learn"])])
 def test_environment_matches_pyproject(env, extra):
-    wanted = {CONDA_NAME.get(k, k): v for k, v in parsed(PROJECT["dependencies"] + extra).items() if k not in DRIVES_THE_JOBS}
+    wanted = {
+        CONDA_NAME.get(k, k): v for k, v in parsed(PROJECT["dependencies"] + extra).items() if k not in DRIVES_THE_JOBS
+    }
     found = listed(env)
     assert found.pop("python") == PROJECT["requires-python"].removeprefix(">=")
     assert found == wanted

@@ -26,7 +26,15 @@ def files(tmp_path):
 
 def make(files, **settings):
     folder, raster = files
-    config = {"scene": "s", "raster": str(raster), "dtm": 0, "models": str(folder / "a"), "block": 2, **toy.VIEW, **settings}
+    config = {
+        "scene": "s",
+        "raster": str(raster),
+        "dtm": 0,
+        "models": str(folder / "a"),
+        "block": 2,
+        **toy.VIEW,
+        **settings,
+    }
     ((name, full),) = plan.scenes(config, SCHEMA).items()
     return plan.plan(name, full, folder, folder / "results")
 
@@ -47,7 +55,12 @@ def test_blocks_cover_the_raster(files):
 
 
 def test_another_corner_model_leaves_sections_alone(files):
-    assert changed(files, models=str(files[0] / "b")) - {"model_sections"} == {"model_corners", "blend", "corners", *AFTER_DETECTION}
+    assert changed(files, models=str(files[0] / "b")) - {"model_sections"} == {
+        "model_corners",
+        "blend",
+        "corners",
+        *AFTER_DETECTION,
+    }
 
 
 def test_another_view_leaves_detection_alone(files):

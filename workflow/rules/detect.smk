@@ -137,19 +137,6 @@ rule feed:
         " --corners {output.corners:q} > {log:q} 2>&1"
 
 
-def source(wildcards):
-    """The folder of a block's detections: by the models, or fed from the truth."""
-    return "fed" if plan(wildcards).settings["feed"] == "truth" else "detected"
-
-
-def detections(wildcards):
-    """What `stitch` joins: four files of every block."""
-    files = ("pieces.parquet", "links.parquet", "seams.npz", "corners.parquet")
-    return [
-        f for name in files for f in blocks(f"{source(wildcards)}/{name}")(wildcards)
-    ]
-
-
 given = inputs(
     "stitch",
     "results/{scene}/stitched/sections.parquet",

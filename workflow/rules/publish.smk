@@ -1,30 +1,5 @@
 # The published files, one rule per format.
 
-PUBLISHED = [
-    "city.gpkg",
-    "city.city.json",
-    "city.city.jsonl",
-    "points.txt",
-    "heights.tif",
-    "labels.tif",
-    "preview.png",
-    "run.json",
-]
-
-
-def published(p):
-    """All published files of a scene."""
-    names = PUBLISHED + (["evaluation.json"] if p.truth else [])
-    return [f"results/{p.name}/{f}" for f in names]
-
-
-def licensed(wildcards):
-    """The records of the models whose licence the results inherit: none when the truth is fed in their place."""
-    tasks = (
-        [] if plan(wildcards).settings["feed"] == "truth" else ["sections", "corners"]
-    )
-    return [f"results/{wildcards.scene}/models/{task}.json" for task in tasks]
-
 
 given = inputs("solids", "results/{scene}/city.gpkg")
 

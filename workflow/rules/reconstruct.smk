@@ -107,26 +107,3 @@ rule solids:
     shell:
         "python -m kibs_steps.solids --scene {input.scene:q} --buildings {input.buildings:q} --name {wildcards.block}"
         " {params.options:q} --out {output.solids:q} --attributes {output.attributes:q} > {log:q} 2>&1"
-
-
-def kept(p):
-    """The files of every block that stay on disk: one that is missing is made again."""
-    detected = (
-        ["fed/corners.parquet"]
-        if p.settings["feed"] == "truth"
-        else [
-            "tiles.tif",
-            "sections.tif",
-            "detected/pieces.parquet",
-            "detected/corners.parquet",
-        ]
-    )
-    files = [
-        *detected,
-        "planes.parquet",
-        "filed_corners.parquet",
-        "ground.parquet",
-        "solids.parquet",
-        "solids.city.jsonl",
-    ]
-    return [f"results/{p.name}/blocks/{b.name}/{f}" for b in p.blocks for f in files]
