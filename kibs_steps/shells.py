@@ -9,7 +9,7 @@ four faces: one of the high faces is chamfered there.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from math import atan2, hypot
 from typing import NamedTuple
@@ -152,7 +152,10 @@ def _wedges(faces: Sequence[Face]) -> dict[Point, list[list[tuple[int, Point, Po
 def _alternating(
     faces: Sequence[Face], levels: dict[Point, dict[int, int]]
 ) -> dict[Point, list[tuple[int, Point, Point]]]:
-    """Vertices round which high and low alternate, each with the wedges of the narrowest high run (to be chamfered)."""
+    """Vertices round which high and low alternate, each with the wedges of the narrowest high run (to be chamfered).
+
+    So are those that one face visits twice, with the narrower of its wedges.
+    """
     bad = {}
     for point, runs in _wedges(faces).items():
         whole = len(runs) == 1 and runs[0][0][1] == runs[0][-1][2]
@@ -176,6 +179,11 @@ def _alternating(
             if len(arcs) > 1:
                 bad[point] = min(arcs, key=lambda arc, p=point: (_angle(p, arc), arc[0][1]))
                 break
+        else:
+            visits = Counter(wedge[0] for wedge in circle if wedge is not None)
+            again = [[wedge] for wedge in circle if wedge is not None and visits[wedge[0]] > 1]
+            if again:
+                bad[point] = min(again, key=lambda arc, p=point: (_angle(p, arc), arc[0][1]))
     return bad
 
 

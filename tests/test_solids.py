@@ -137,6 +137,18 @@ def test_a_ring_that_touches_itself_in_a_point_is_chamfered():
     assert shells_are_valid(solid)
 
 
+def test_a_section_that_touches_itself_round_a_higher_one_is_chamfered():
+    inner, low = shapely.Polygon([(0, 5), (4, 3), (4, 7)]), shapely.Polygon([(0, 5), (4, 7), (4, 12), (0, 12)])
+    outer = shapely.box(0, 0, 12, 12) - inner - low
+    shapes, planes = [outer, inner, low], np.zeros((3, 3))
+    for z in ([4.0, 6.0, 3.0], [4.0, 3.0, 6.0], [4.0, 6.0, 4.0]):
+        planes[:, 2] = z
+        sections = solids.Sections(np.arange(1, 4), shapes, planes.copy(), ["ok"] * 3, np.full(3, 0.1), (0, 0))
+        solid = solids.build(sections, FLAT)
+        assert solid.lod == "2.0"
+        assert shells_are_valid(solid)
+
+
 def test_parts_that_do_not_touch_are_building_parts():
     apart = [*houses.BOX, ([(9, 0), (14, 0), (14, 4), (9, 4)], (0, 0, 4))]
     sections, solid, row = built(apart)
