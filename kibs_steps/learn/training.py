@@ -30,7 +30,7 @@ from kibs_steps.models.contract import ContractMismatch
 
 DISTANCE_CLIP = 5.0  # px
 BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
-SHARES = {"sections": (0.5, 0.25, 0.25), "corners": (0.75, 0.25, 0.0)}  # simulated, pasted houses, chips
+SHARES = {"sections": (0.6, 0.2, 0.2), "corners": (0.75, 0.25, 0.0)}  # simulated, pasted houses, chips
 EDGES, CENTRES = targets.height_bins()
 
 Batch = dict[str, torch.Tensor]
@@ -163,10 +163,10 @@ def network(task: str) -> Dense:
 
 
 def start_from(model: Dense, checkpoint: str | Path) -> int:
-    """Fills a network with the averaged weights of another run where names and shapes agree; returns how many did."""
-    other = torch.load(checkpoint, weights_only=True, map_location="cpu")["average"]
-    own = model.state_dict()
-    fitting = {k: v for k, v in other.items() if k in own and own[k].shape == v.shape and not k.startswith("maps.")}
+    """Fills a network with the averaged weights of another run, but for the heads of another task; returns how many tensors."""
+    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    heads = () if state["settings"]["task"] == model.task else ("maps.", "height.")
+    fitting = {name: value for name, value in state["average"].items() if not name.startswith(heads)}
     model.load_state_dict(fitting, strict=False)
     return len(fitting)
 
