@@ -14,6 +14,7 @@ rule evaluation:
         labels=given("results/{scene}/labels.tif"),
         heights=given("results/{scene}/heights.tif"),
         sections=given("results/{scene}/buildings.parquet"),
+        corners=given(blocks("filed_corners.parquet")),
     output:
         evaluation="results/{scene}/evaluation.json",
         picture="results/{scene}/evaluation.png",
@@ -26,5 +27,6 @@ rule evaluation:
         fallback=lambda w: plan(w).models["corners"].contract["heights"]["fallback"],
     shell:
         "python -m kibs_steps.evaluate --scene {input.scene:q} --truth {input.truth:q} --labels {input.labels:q}"
-        " --heights {input.heights:q} --sections {input.sections:q} --fallback-height {params.fallback}"
+        " --heights {input.heights:q} --sections {input.sections:q} --corners {input.corners:q}"
+        " --fallback-height {params.fallback}"
         " --out {output.evaluation:q} --picture {output.picture:q} > {log:q} 2>&1"

@@ -38,6 +38,7 @@ rule cityjson:
     input:
         scene=given("results/{scene}/scene.json"),
         solids=given(blocks("solids.city.jsonl")),
+        models=given(licensed),
     output:
         city="results/{scene}/city.city.json",
         sequence="results/{scene}/city.city.jsonl",
@@ -49,7 +50,7 @@ rule cityjson:
         signature=signature("solids"),
     shell:
         "python -m kibs_steps.publish.cityjson --scene {input.scene:q} --solids {input.solids:q}"
-        " --out {output.city:q} --seq {output.sequence:q} > {log:q} 2>&1"
+        " --models {input.models:q} --out {output.city:q} --seq {output.sequence:q} > {log:q} 2>&1"
 
 
 given = inputs("buildings", "results/{scene}/points.txt")
