@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,7 @@ def geometry_vector(view: tuple[float, float] | None, sun: tuple[float, float] |
 def open_network(model: contracts.Model, geometry: np.ndarray, threads: int = 1) -> Network:
     """A function from an image (s, s, 3) uint8 to the model's named outputs without their batch axis.
 
+    Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged.
     `geometry` (1, 6) goes to models whose contract asks for it. CPU provider; `threads` intra-op threads.
     """
     import onnxruntime as ort
@@ -48,14 +50,58 @@ def open_network(model: contracts.Model, geometry: np.ndarray, threads: int = 1)
     wants_geometry = bool(model.contract.get("geometry_input"))
     dense = model.contract["head"] == "dense"
 
-    def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
+    def run(rgb: np.ndarray, geometry: np.ndarray) -> dict[str, np.ndarray]:
         feed = {"image": contracts.normalise(rgb, model.contract)}
         if wants_geometry:
             feed["geometry"] = geometry
         outputs = session.run(names, feed)
         return {name: (value[0] if dense else value) for name, value in zip(names, outputs, strict=True)}
 
+    views = [Flip(bool(i & 4), bool(i & 1), bool(i & 2)) for i in range(model.contract.get("flips", 1) if dense else 1)]
+
+    def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
+        total: dict[str, np.ndarray] = {}
+        for flip in views:
+            for name, value in flip.back(run(flip.image(rgb), flip.geometry(geometry))).items():
+                total[name] = total[name] + value if name in total else value
+        return {name: value / np.float32(len(views)) for name, value in total.items()} if len(views) > 1 else total
+
     return network
+
+
+class Flip(NamedTuple):
+    """One of the eight symmetries of a square tile: transposed, then mirrored in columns, then in rows."""
+
+    transpose: bool
+    columns: bool
+    rows: bool
+
+    def image(self, rgb: np.ndarray) -> np.ndarray:
+        """The image (s, s, 3) seen so."""
+        rgb = rgb.transpose(1, 0, 2) if self.transpose else rgb
+        return rgb[:: -1 if self.rows else 1, :: -1 if self.columns else 1]
+
+    def geometry(self, vector: np.ndarray) -> np.ndarray:
+        """The geometry input (1, 6) of the image seen so: its displacements (col, row) turn with the image."""
+        vector = vector.copy()
+        if self.transpose:
+            vector[0, :4] = vector[0, [1, 0, 3, 2]]
+        vector[0, [0, 2]] *= -1 if self.columns else 1
+        vector[0, [1, 3]] *= -1 if self.rows else 1
+        return vector
+
+    def back(self, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Maps (C, s, s) of the flipped image as maps of the image itself; `offset` (col, row) turns with it."""
+        out = {}
+        for name, value in maps.items():
+            value = value[:, :: -1 if self.rows else 1, :: -1 if self.columns else 1]
+            if name == "offset":
+                value = value * np.array([-1 if self.columns else 1, -1 if self.rows else 1], np.float32)[:, None, None]
+            if self.transpose:
+                value = value.transpose(0, 2, 1)
+                value = value[::-1] if name == "offset" else value
+            out[name] = np.ascontiguousarray(value)
+        return out
 
 
 def from_record(path: str | Path, task: str) -> contracts.Model:

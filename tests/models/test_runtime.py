@@ -1,0 +1,50 @@
+"""Running models: symmetric views of a tile come back to where they belong."""
+
+import numpy as np
+import pytest
+import toy
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kibs_steps.models import contract, heads, runtime
+from kibs_steps.models.runtime import Flip
+from kibs_steps.view import lean
+
+ALL = [Flip(bool(i & 4), bool(i & 1), bool(i & 2)) for i in range(8)]
+
+
+@pytest.mark.parametrize("flip", ALL)
+def test_there_and_back(flip):
+    """A map made of the flipped image comes back as a map of the image."""
+    rgb = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
+    maps = {"roof": flip.image(rgb)[..., 0][None].astype(np.float32)}
+    np.testing.assert_array_equal(flip.back(maps)["roof"][0], rgb[..., 0])
+
+
+@given(st.sampled_from(ALL), st.integers(2, 12), st.integers(2, 12), st.floats(-1, 1), st.floats(-1, 1))
+def test_offsets_and_geometry_turn_with_the_image(flip, col, row, east, south):
+    """A mark and the pixel its displacement leads to: displaced in the flipped image, it is the same pixel."""
+    size, step = 15, np.round([2 * east, 2 * south])
+    vector = np.zeros((1, 6), np.float32)
+    vector[0, :2] = vector[0, 2:4] = step
+    rgb = np.zeros((size, size, 3), np.uint8)
+    rgb[row, col, 0] = 1
+    rgb[int(row + step[1]), int(col + step[0]), 1] = 1
+    seen, turned = flip.image(rgb), flip.geometry(vector)
+    (r,), (c,) = np.nonzero(seen[..., 0])
+    assert seen[int(r + turned[0, 1]), int(c + turned[0, 0]), 1] == 1
+    offset = np.zeros((2, size, size), np.float32)
+    offset[:, r, c] = turned[0, 2:4]
+    np.testing.assert_array_equal(flip.back({"offset": offset})["offset"][:, row, col], step)
+
+
+def test_flips_leave_a_symmetric_network_alone(tmp_path):
+    """The toy networks treat all directions alike, so eight views give what one gives."""
+    image = toy.paint(toy.houses(np.random.default_rng(2), toy.TILE, toy.TILE), toy.TILE, toy.TILE)
+    geometry = runtime.geometry_vector(lean(181, 59), None, toy.GSD)
+    found = []
+    for flips in (1, 8):
+        model = contract.load(toy.corners_model(tmp_path / f"{flips}.onnx", toy.contract("corners", flips=flips)))
+        found.append(heads.decode_corners(runtime.open_network(model, geometry)(image), model.contract))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
