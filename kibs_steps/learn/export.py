@@ -20,6 +20,7 @@ from kibs_steps.learn.architectures import OUTPUTS, Dense
 from kibs_steps.models import contract as contracts
 
 TILE, MARGIN = 256, 16
+FLIPS = 8  # views a tile is seen in: networks trained briefly gain much from it
 THRESHOLDS = {
     "sections": {"roof": 0.5, "marker": 0.5, "distance_clip": training.DISTANCE_CLIP, "min_area": 12},
     "corners": {"corner": 0.3, "corner_radius": 7.5},
@@ -42,6 +43,7 @@ def contract_of(task: str, heights: tuple[float, float] | None = None, **facts: 
         "margin": MARGIN,
         "input": {"channels": "RGB", "scale": 1.0, "mean": [127.0] * 3, "std": [128.0] * 3},
         "geometry_input": True,
+        "flips": FLIPS,
         "thresholds": {**THRESHOLDS[task], **facts.get("thresholds", {})},
         "trained_on": {
             "view_elevation": [50, 90],
