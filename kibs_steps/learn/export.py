@@ -109,6 +109,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.export", description=main.__doc__)
     parser.add_argument("--checkpoint", required=True)
     parser.add_argument("--out", required=True, help="ONNX file")
+    parser.add_argument("--weights", help="also write the weights here, for other runs to start from (training --init)")
     parser.add_argument("--pool", help="simulated tiles, for the mean corner height")
     parser.add_argument("--thresholds", type=json.loads, default={}, help="JSON, replaces thresholds of the contract")
     parser.add_argument("--metrics", help="report of learn.validation, kept in the contract")
@@ -125,6 +126,10 @@ def main(argv: list[str] | None = None) -> None:
         facts["metrics"] = store.read_json(args.metrics)
     heights = corner_height_moments(Path(args.pool)) if args.pool and task == "corners" else None
     export(model, args.out, contract_of(task, heights, **facts))
+    if args.weights:
+        halves = {k: v.half() if v.is_floating_point() else v for k, v in state["average"].items()}
+        with store.whole(args.weights) as temporary:
+            torch.save({"average": halves, "settings": state["settings"]}, temporary)
     print(f"{args.out}: {state['step']} steps, {state['seconds'] / 60:.0f} min")
 
 
