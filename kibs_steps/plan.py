@@ -203,7 +203,8 @@ def signatures(
     s["blend"] = h(s["sections"], models["corners"].sha256)
     s["corners"] = h(s["blend"], seen["corners"])
     s["feed"] = h(s["truth"], tiling)
-    s["stitch"] = h(s["feed"] if settings["feed"] == "truth" else s["corners"])
+    # The corner model says how far corners may lie from their section, also where the truth is fed.
+    s["stitch"] = h(s["feed"] if settings["feed"] == "truth" else s["corners"], models["corners"].sha256)
     s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
     s["buildings"] = h(s["planes"], content("footprints"))
     s["solids"] = h(s["buildings"], settings["lod_label"])
