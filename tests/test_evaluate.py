@@ -11,8 +11,8 @@ import toy_city as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kibs_steps import evaluate, store, truth, view
-from kibs_steps.evaluate import Corners
+from kibs_steps import evaluate, metrics, store, truth, view
+from kibs_steps.metrics import Corners
 from kibs_steps.publish import rasters
 
 
@@ -33,18 +33,18 @@ def label_images():
 
 def section_scores(true, found, score=None):
     """Section figures of two label images; `score` by predicted id."""
-    pairs = evaluate.count_pairs(true, found)
+    pairs = metrics.count_pairs(true, found)
     ids = np.unique(found[found > 0])
     scores = np.array([(score or {}).get(int(i), 1.0) for i in ids])
-    over = evaluate.overlaps(pairs, scores)
-    return evaluate.section_figures(over, scores, np.ones(len(over.truth), bool), np.ones(len(ids), bool))
+    over = metrics.overlaps(pairs, scores)
+    return metrics.section_figures(over, scores, np.ones(len(over.truth), bool), np.ones(len(ids), bool))
 
 
 @given(label_images())
 @settings(max_examples=60, deadline=None)
 def test_pixels_and_sections_against_brute_force(images):
     true, found = images
-    pixels = evaluate.pixel_figures(evaluate.count_pairs(true, found))
+    pixels = metrics.pixel_figures(metrics.count_pairs(true, found))
     t, f = true > 0, found > 0
 
     def share(part, whole):
@@ -80,7 +80,7 @@ def test_perfect_sections():
 def test_calling_everything_roof_pleases_the_papers_iou_alone():
     true = np.zeros((100, 100), int)
     true[:20, :70] = 1
-    pixels = evaluate.pixel_figures(evaluate.count_pairs(true, np.ones_like(true)))
+    pixels = metrics.pixel_figures(metrics.count_pairs(true, np.ones_like(true)))
     assert pixels["paper_iou"] == 1.0
     assert pixels["iou"] == pytest.approx(0.14)
 
@@ -107,9 +107,9 @@ def test_average_precision_by_hand():
 def test_merged_windows_are_the_whole():
     rng = np.random.default_rng(1)
     true, found = rng.integers(0, 5, (60, 50)), rng.integers(0, 9, (60, 50))
-    parts = [evaluate.count_pairs(true[r : r + 16, c : c + 16], found[r : r + 16, c : c + 16]) for r in range(0, 60, 16)
+    parts = [metrics.count_pairs(true[r : r + 16, c : c + 16], found[r : r + 16, c : c + 16]) for r in range(0, 60, 16)
              for c in range(0, 50, 16)]  # fmt: skip
-    for one, other in zip(evaluate.merge_pairs(parts), evaluate.count_pairs(true, found), strict=True):
+    for one, other in zip(metrics.merge_pairs(parts), metrics.count_pairs(true, found), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -121,7 +121,7 @@ def test_height_errors_against_numpy(seed, spread, bias):
     true = rng.uniform(0, 30, n)
     found = true + rng.normal(bias, spread, n)
     group = rng.integers(0, 4, n)
-    figures = evaluate.height_figures(evaluate.tally(group, found, true, 6.1, 4).of(np.s_[:]))
+    figures = metrics.height_figures(metrics.tally(group, found, true, 6.1, 4).of(np.s_[:]))
     error = found - true
     assert figures["pixels"] == n
     assert figures["mae"] == pytest.approx(np.abs(error).mean())
@@ -139,14 +139,14 @@ def test_height_errors_against_numpy(seed, spread, bias):
         assert figures["mape"] == pytest.approx(mape)
         assert figures["paper_accuracy"] == pytest.approx(100 - mape)
     assert figures["baseline_mae"] == pytest.approx(np.abs(6.1 - true).mean())
-    one = evaluate.height_figures(evaluate.tally(group, found, true, 6.1, 4).of(np.array([2])))
+    one = metrics.height_figures(metrics.tally(group, found, true, 6.1, 4).of(np.array([2])))
     assert one["pixels"] == (group == 2).sum()
 
 
 def test_impossible_figures_are_refused():
-    errors = evaluate.tally(np.zeros(3, int), np.array([1.0, 2, 3]), np.zeros(3) + 2, 6.1, 1)
-    with pytest.raises(evaluate.ImpossibleFigures):
-        evaluate.height_figures(errors._replace(square=errors.square * 0.5))
+    errors = metrics.tally(np.zeros(3, int), np.array([1.0, 2, 3]), np.zeros(3) + 2, 6.1, 1)
+    with pytest.raises(metrics.ImpossibleFigures):
+        metrics.height_figures(errors._replace(square=errors.square * 0.5))
 
 
 def test_plane_errors_by_hand():
@@ -154,7 +154,7 @@ def test_plane_errors_by_hand():
     steep = [np.tan(np.radians(angle)) for angle in (30, 35, 20)]
     true = np.array([[steep[0], 0], [steep[2], 0], [0, 0]])
     found = np.array([[steep[1], 0], [0, steep[2]], [0, 0]])
-    figures = evaluate.plane_figures(true, found)
+    figures = metrics.plane_figures(true, found)
     assert figures["slope_mae"] == pytest.approx(5 / 3)
     assert figures["azimuth_sections"] == 2
     assert figures["azimuth_mae"] == pytest.approx(45)
@@ -164,7 +164,7 @@ def test_plane_errors_by_hand():
 
 def test_azimuths_across_north():
     g = [-np.array([np.sin(np.radians(a)), np.cos(np.radians(a))]) for a in (359, 2)]
-    assert evaluate.plane_figures(np.array([g[0]]), np.array([g[1]]))["azimuth_mae"] == pytest.approx(3)
+    assert metrics.plane_figures(np.array([g[0]]), np.array([g[1]]))["azimuth_mae"] == pytest.approx(3)
 
 
 def corners(points, heights, seen=True):
@@ -174,7 +174,7 @@ def corners(points, heights, seen=True):
 def test_corners_each_once():
     true = corners([[10, 10], [20, 10], [30, 10], [50, 50]], [5, 5, 8, 8])
     found = corners([[10, 11], [10.5, 10], [20, 12.5], [30, 10]], [4, 6, 5, 8.5])
-    figures = evaluate.corner_figures(true, found)
+    figures = metrics.corner_figures(true, found)
     assert figures["matched"] == 2
     assert (figures["precision"], figures["recall"]) == (0.5, 0.5)
     assert figures["position_mae_px"] == pytest.approx(0.25)
@@ -183,12 +183,12 @@ def test_corners_each_once():
 
 def test_hidden_corners_neither_count_nor_harm():
     true = corners([[10, 10], [20, 10], [30, 10]], [5, 5, 5], [True, False, False])
-    figures = evaluate.corner_figures(true, corners([[10, 10], [20, 10], [40, 10]], [5, 5, 5]))
+    figures = metrics.corner_figures(true, corners([[10, 10], [20, 10], [40, 10]], [5, 5, 5]))
     assert (figures["truth"], figures["predicted"], figures["matched"]) == (1, 2, 1)
 
 
 def test_shared_corners_are_one():
-    shared = evaluate.merge_corners(
+    shared = metrics.merge_corners(
         corners([[1, 1], [1.2, 1], [1, 1], [9, 9]], [5, 5, 9, 5], [False, True, False, False])
     )
     assert len(shared.height) == 3
