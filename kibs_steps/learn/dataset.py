@@ -37,6 +37,7 @@ class Sample(NamedTuple):
     labels: np.ndarray
     roof: np.ndarray
     height: np.ndarray
+    surface: np.ndarray
     corners: np.ndarray
     corner_heights: np.ndarray
     corners_known: np.ndarray
@@ -126,6 +127,7 @@ def empty(rgb: np.ndarray) -> Sample:
         np.zeros(size, np.int32),
         np.zeros(size, np.uint8),
         np.full(size, np.nan, np.float32),
+        np.full(size, UNKNOWN, np.uint8),
         np.zeros((0, 2), np.float32),
         np.zeros(0, np.float32),
         np.ones(size, np.uint8),
@@ -135,9 +137,9 @@ def empty(rgb: np.ndarray) -> Sample:
 
 def simulated(
     rng: np.random.Generator,
-    size: int = 256,
+    size: int = 320,
     backgrounds: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
-    view_elevation: tuple[float, float] = (50.0, 90.0),
+    view_elevation: tuple[float, float] = (45.0, 90.0),
 ) -> Sample:
     """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere.
 
@@ -153,6 +155,7 @@ def simulated(
         section,
         (section > 0).astype(np.uint8),
         rendering.height.astype(np.float32),
+        rendering.surface,
         rendering.corners.astype(np.float32).reshape(-1, 2),
         rendering.corner_heights.astype(np.float32),
         np.ones(section.shape, np.uint8),
@@ -301,7 +304,7 @@ def dihedral(sample: Sample, k: int) -> Sample:
         corners = np.stack([corners[:, 1], size - corners[:, 0]], axis=1)
         vectors = np.stack([vectors[:, 1], -vectors[:, 0]], axis=1)
     return Sample(
-        *(image(a) for a in sample[:4]),
+        *(image(a) for a in sample[:5]),
         corners,
         sample.corner_heights,
         image(sample.corners_known),
@@ -315,7 +318,7 @@ def window(sample: Sample, row: int, col: int, size: int) -> Sample:
     corners = sample.corners - np.float32([col, row])
     inside = (corners >= 0).all(1) & (corners < size).all(1)
     return Sample(
-        *(a[part] for a in sample[:4]),
+        *(a[part] for a in sample[:5]),
         corners[inside],
         sample.corner_heights[inside],
         sample.corners_known[part],
