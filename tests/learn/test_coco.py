@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("pycocotools", reason="COCO needs the extra `learn` (pycocotools)")
 
-from kibs_steps.learn import coco, dataset  # noqa: E402
+from kibs_steps.learn import coco, dataset
 
 SIZE = 40
 
