@@ -35,7 +35,7 @@ def distance(labels: np.ndarray, clip: float) -> np.ndarray:
 
 
 def surface(kinds: np.ndarray, count: int) -> np.ndarray:
-    """Share of each of `count` kinds of surface in each cell of HEIGHT_STRIDE px, float32 (count, h/4, w/4); zero where unknown."""
+    """Share of each of `count` kinds of surface in cells of HEIGHT_STRIDE px, float32 (count, h/4, w/4); zero where unknown."""
     rows, cols = (n // HEIGHT_STRIDE for n in kinds.shape)
     cells = kinds.reshape(rows, HEIGHT_STRIDE, cols, HEIGHT_STRIDE)
     shares = np.stack([(cells == kind).mean((1, 3)) for kind in range(count)]).astype(np.float32)

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-
 PROMINENCE = 0.2  # of a section's summit, where the contract does not say
 SMOOTH = 0.5  # px: summits one pixel wide are noise
 

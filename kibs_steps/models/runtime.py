@@ -113,7 +113,7 @@ FLIPS = [Flip(bool(i & 4), bool(i & 1), bool(i & 2)) for i in range(8)]
 
 
 def leans_up(col: float, row: float) -> bool:
-    """Whether a lean (px per metre) points up in the image, and not further left than up nor at all right: one octant of eight."""
+    """Whether a lean (px per metre) points up in the image, less left than up and not right: one octant of eight."""
     return bool(row <= 0 and 0 <= -col <= -row)
 
 
