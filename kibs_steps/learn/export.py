@@ -83,12 +83,12 @@ def contract_of(
     return contracts.validate(contract, "the new contract")
 
 
-def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float]:
-    """Mean and standard deviation (m) of the corners' heights in the first kept tiles of a pool."""
+def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float] | None:
+    """Mean and standard deviation (m) of the corners' heights in the first kept tiles of a pool; None without any."""
     heights = [dataset.load(path).corner_heights for path in sorted(pool.glob("[!.]*.npz"))[:most]]
-    known = np.concatenate(heights)
+    known = np.concatenate([*heights, np.zeros(0, np.float32)])
     known = known[np.isfinite(known)]
-    return float(known.mean()), float(known.std())
+    return (float(known.mean()), float(known.std())) if len(known) else None
 
 
 def export(model: nn.Module, path: str | Path, contract: dict[str, Any]) -> None:
@@ -140,7 +140,7 @@ def main(argv: list[str] | None = None) -> None:
         facts["commit"] = args.commit
     if args.metrics:
         facts["metrics"] = store.read_json(args.metrics)
-    if args.pool and task != "sections":
+    if heights is None and args.pool and task != "sections":
         heights = corner_height_moments(Path(args.pool))
     export(model, args.out, contract_of(task, heights, settings.family, **facts))
     if args.weights:
