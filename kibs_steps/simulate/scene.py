@@ -26,11 +26,17 @@ from kibs_steps.scene import Direction, convergence
 from kibs_steps.simulate import camera, citymodel, light, real
 from kibs_steps.simulate.city import MIXTURES, STYLES, procedural
 from kibs_steps.simulate.citymodel import CityModel
-from kibs_steps.simulate.site import CLUTTER, ROOF, City, pick
+from kibs_steps.simulate.site import CLUTTER, ROOF, WALL, City, pick
 from kibs_steps.terrain import Terrain, flat
 
 STRIP = 256  # rows shaded at a time
 BIAS = 0.2  # m: a face this little above another does not shade it
+# What a pixel shows first: furniture of a roof counts as roof; ground the sun does not reach is a surface of its own.
+GROUND, ON_ROOF, ON_WALL, OTHER, SHADED_GROUND = range(5)
+
+
+# Azimuth, elevation and half angle (deg) of views that random scenes never show: models are judged there.
+HELD_OUT_CONE = (250.0, 62.0, 5.0)
 
 
 class SectionTruth(NamedTuple):
@@ -51,6 +57,7 @@ class Rendering(NamedTuple):
     rgb: np.ndarray
     section: np.ndarray
     height: np.ndarray
+    surface: np.ndarray
     sections: list[SectionTruth]
     corners: np.ndarray
     corner_heights: np.ndarray
@@ -171,16 +178,17 @@ def render(
     """Render a city on its terrain.
 
     Returns `rgb` uint8 (h, w, 3); `section` int32 (h, w), the visible section or 0; `height` float32 (h, w), m above ground at
-    the true position, NaN off sections; `sections`, the truth of all sections whose image meets the grid; `corners` float32
-    (n, 2) px col, row of section corners that can be seen, with `corner_heights` (n,) m above ground and `corner_sections`
-    (n,). `backgrounds`: photographs of ground, uint8 (h, w, 3), each with a mask of its usable pixels, bool (h, w); drawn
-    over parts of the painted ground. `look`: the camera, drawn if None.
+    the true position, NaN off sections; `surface` uint8 (h, w), the kind of what is seen (GROUND …); `sections`, the truth of
+    all sections whose image meets the grid; `corners` float32 (n, 2) px col, row of section corners that can be seen, with
+    `corner_heights` (n,) m above ground and `corner_sections` (n,). `backgrounds`: photographs of ground, uint8 (h, w, 3),
+    each with a mask of its usable pixels, bool (h, w); drawn over parts of the painted ground. `look`: the camera, drawn if
+    None.
     """
     samples = _sample_frame(grid)
     city = _near(city, terrain, samples, view.lean, sun.lean)
     seen = _see(city, terrain, samples, view.lean)
     sections = _truth(city, terrain, grid, view.lean, seen.section)
-    shine = _shine(city, seen, samples, sun, rng, sections, backgrounds)
+    shine, lit = _shine(city, seen, samples, sun, rng, sections, backgrounds)
     rgb = camera.photograph(shine, look or camera.camera(rng), rng)
 
     at = np.s_[1::2, 1::2]
@@ -194,7 +202,16 @@ def render(
         true_at = seen_at + (z[on] - terrain(seen_at))[:, None] * np.array(view.lean)
         height[on] = z[on] - terrain(true_at)
     corners = _corners(sections, section)
-    return Rendering(rgb, section, height, sections, *corners)
+    return Rendering(rgb, section, height, _surface(city, seen.face[at], lit[at]), sections, *corners)
+
+
+def _surface(city: City, face: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Kind of surface, uint8, of the faces seen (−1 ground) and whether the sun reaches them."""
+    of_kind = {ROOF: ON_ROOF, CLUTTER: ON_ROOF, WALL: ON_WALL}
+    table = np.array([of_kind.get(f.kind, OTHER) for f in city.faces] + [GROUND], np.uint8)
+    surface = table[face]
+    surface[(face < 0) & (lit == 0)] = SHADED_GROUND
+    return surface
 
 
 def _shine(
@@ -205,8 +222,8 @@ def _shine(
     rng: np.random.Generator,
     sections: list[SectionTruth],
     backgrounds: list[tuple[np.ndarray, np.ndarray]] | None,
-) -> np.ndarray:
-    """Radiance (rows, cols, 3) float32 of all samples, worked out in strips of rows to bound the memory."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance (rows, cols, 3) of all samples, in strips of rows to bound the memory, and where the sun shines (0, 1)."""
     # Textures in float32 need small coordinates: an origin near by.
     origin = np.array([samples.x0, samples.y0, 0.0])
     near = city._replace(faces=[f._replace(ring=f.ring - origin) for f in city.faces])
@@ -238,7 +255,7 @@ def _shine(
             source,
         )
         shine[rows] = light_here.reshape(-1, shape[1], 3)
-    return shine
+    return shine, lit
 
 
 def _rims(city: City, sections: list[SectionTruth], shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
@@ -388,6 +405,17 @@ def _roofs_within(city: City, side: float) -> int:
     return sum(f.kind == ROOF and 0 < f.ring[0, 0] < side and 0 < f.ring[0, 1] < side for f in city.faces)
 
 
+def _random_view(rng: np.random.Generator, low: float, high: float) -> tuple[float, float]:
+    """Azimuth and elevation (deg) of a satellite, oblique views more often than steep ones, never within HELD_OUT_CONE."""
+    while True:
+        azimuth = rng.uniform(0, 360)
+        elevation = min(rng.triangular(low, low + 0.3 * (high - low), high) if high > low else low, 89.9)
+        held_azimuth, held_elevation, cone = HELD_OUT_CONE
+        off = abs((azimuth - held_azimuth + 180) % 360 - 180)
+        if high == low or np.hypot(off * np.cos(np.radians(held_elevation)), elevation - held_elevation) > cone:
+            return azimuth, elevation
+
+
 def random_scene(
     rng: np.random.Generator,
     size: int = 256,
@@ -406,9 +434,11 @@ def random_scene(
     """
     side = size * gsd
     grid = Grid("", 0.0, side, gsd, size, size)
-    view = _direction(rng.uniform(0, 360), min(rng.uniform(*view_elevation), 89.9))
+    view = _direction(*_random_view(rng, *view_elevation))
     sun = _direction(rng.uniform(0, 360), rng.uniform(*sun_elevation))
-    style = style or str(rng.choice([*STYLES, "mixed"], p=[0.2, 0.15, 0.11, 0.12, 0.09, 0.08, 0.02, 0.05, 0.05, 0.13]))
+    style = style or str(
+        rng.choice([*STYLES, "mixed", "town"], p=[0.18, 0.13, 0.1, 0.11, 0.09, 0.08, 0.02, 0.05, 0.05, 0.11, 0.08])
+    )
     margin = 25.0 + (15.0 if style in ("centre", "perimeter") else 0.0)
     terrain = flat(0.0)
     if rng.random() < 0.35:
