@@ -127,8 +127,13 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
         if abs(simulated["gsd"] / terms["gsd"] - 1) > 0.005:
             raise BadConfig(f"scene {name}: simulate.gsd {simulated['gsd']} m, the models work at {terms['gsd']} m")
         width = height = int(simulated["size"])
+        city = simulated.get("city")
+        if city and not Path(city).is_file():
+            raise BadConfig(f"scene {name}: simulate.city {city} is not there: name a CityJSON file")
         source = fingerprint.of_values(
-            simulated, [settings[f"{k}_{a}"] for k in ("view", "sun") for a in ("azimuth", "elevation")]
+            {k: v for k, v in simulated.items() if k != "city"},
+            *([fingerprint.of_file(city, cache)] if city else []),
+            [settings[f"{k}_{a}"] for k in ("view", "sun") for a in ("azimuth", "elevation")],
         )
         truth_source = source
     else:
