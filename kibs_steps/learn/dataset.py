@@ -10,13 +10,16 @@ from __future__ import annotations
 import tarfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
 from kibs_steps.errors import KibsError
 from kibs_steps.models import runtime
+
+if TYPE_CHECKING:
+    from kibs_steps.simulate.citymodel import CityModel
 
 GSD = 0.38  # m per px of the models trained here
 GRAPH_GSD = 0.06  # m per px, about, of the roof-graph photographs
@@ -143,11 +146,12 @@ def simulated(
     view_elevation: tuple[float, float] = (45.0, 90.0),
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
+    cities: Sequence[CityModel] = (),
 ) -> Sample:
     """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere.
 
     `backgrounds` are photographs (rgb, usable as ground: bool) for the simulator's ground. `view` and `sun` (azimuth, elevation
-    deg) fix the directions but for a degree or two, for models of one scene.
+    deg) fix the directions but for a degree or two, for models of one scene. Some tiles show one of the real `cities`.
     """
     from kibs_steps.simulate.scene import random_scene
 
@@ -160,6 +164,7 @@ def simulated(
         backgrounds=backgrounds,
         view=near(view, rng),
         sun=near(sun, rng),
+        cities=cities,
     )
     section = rendering.section.astype(np.int32)
     return Sample(

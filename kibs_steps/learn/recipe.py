@@ -23,6 +23,7 @@ DEFAULTS = {
     "steps": None,
     "seed": 0,
     "tiles": 4000,
+    "cities": [],
     "validation": 0,
     "patience": 10,
     "shares": None,
@@ -80,6 +81,8 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
     options += [f"--family={train['family']}"]
     options += [f"--{key}={train[key]}" for key in ("data", "steps") if train[key] is not None]
+    if train["cities"]:
+        options += ["--cities", *map(str, train["cities"])]
     if train["shares"]:
         options.append("--shares=" + ",".join(f"{k}={v}" for k, v in train["shares"].items()))
     if train["scene"]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from kibs_steps import store
 from kibs_steps.learn import dataset
+from kibs_steps.simulate import citymodel
 
 NAMES = ("simulated", "pasted", "chips", "own")
 SHARES = {"simulated": 0.62, "pasted": 0.23, "chips": 0.15, "own": 0.3}  # of those there are, scaled to sum to 1
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--own", nargs="*", default=[], help="folders of own samples (learn.own)")
     parser.add_argument("--pool", help="folder of simulated tiles, shared between runs (default: OUT/../pool)")
     parser.add_argument("--tiles", type=int, default=4000, help="simulated tiles to render into the pool (0: none)")
+    parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that simulated tiles show parts of")
     parser.add_argument("--shares", type=shares, default={}, help="as in simulated=0.5,pasted=0.2,chips=0.1,own=0.2")
     parser.add_argument("--validation", type=int, default=0, help="simulated validation tiles, besides the own ones")
     for name in ("view", "sun"):
@@ -79,7 +81,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     view = _direction(args.view_azimuth, args.view_elevation)
     sun = _direction(args.sun_azimuth, args.sun_elevation)
     if args.tiles:
-        look = (args.tiles, args.seed, chips, view, sun)
+        look = (args.tiles, args.seed, chips, view, sun, tuple(map(citymodel.read, args.cities)))
         multiprocessing.get_context("fork").Process(target=fill_pool, args=(pool, *look), daemon=True).start()
     wanted = {**SHARES, **args.shares}
     if heights_needed:
@@ -114,6 +116,7 @@ def about(
 ) -> dict[str, Any]:
     """`trained_on` of the contract: data and licence of the sources used, angles, and heights of own corners."""
     data = ["simulated scenes"] if args.tiles or args.pool else []
+    data += [f"simulated scenes of the city in {Path(city).name}" for city in args.cities]
     data += ["roof-graph photographs (Ren et al. 2021), pasted"] if graphs else []
     data += ["chips with building masks"] if chips else []
     data += [f"own samples: {Path(folder).name}" for folder in args.own]
@@ -159,6 +162,7 @@ def fill_pool(
     chips: list[dataset.Chip],
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
+    cities: tuple[citymodel.CityModel, ...] = (),
 ) -> None:
     """Render simulated tiles into a folder until it holds `count`, leaving what is there."""
     os.nice(10)
@@ -169,7 +173,8 @@ def fill_pool(
         path = pool / f"{seed}-{number:06d}.npz"
         if not path.exists():
             rng = np.random.default_rng([seed, number])
-            dataset.save(path, dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun))
+            sample = dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities)
+            dataset.save(path, sample)
 
 
 def _wait_for_first(pool: Path, seconds: float = 600.0) -> None:
