@@ -133,7 +133,8 @@ def main(argv: list[str] | None = None) -> None:
     average = state.get("best", {}).get("average") or state["average"]
     model = training.network(task, settings.family)
     model.load_state_dict(average)
-    about = state.get("about", {})
+    about = {**state.get("about", {}), "tiles_seen": state["step"] * settings.batch}
+    about |= {"minutes": round(state["seconds"] / 60, 1), "converged": state.get("converged")}
     heights = about.pop("corner_heights", None)
     facts: dict[str, Any] = {"thresholds": args.thresholds, "seed": settings.seed, "about": about}
     if args.commit:

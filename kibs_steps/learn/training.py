@@ -330,6 +330,7 @@ def train(
             "seconds": used,
             "best": best._asdict(),
             "about": about or {},
+            "converged": best.since >= patience if judged else None,
         }
         with store.whole(path) as temporary:
             torch.save(content, temporary)
@@ -409,6 +410,9 @@ def main(argv: list[str] | None = None) -> None:
         example_of(sample, np.random.default_rng([args.seed, i, 2]), settings)
         for i, sample in enumerate(found.validation)
     ]
+    found.about["init"] = (
+        Path(args.init).name if args.init else "ImageNet (encoder)" if args.family == "dense" else "none"
+    )
     steps = train(
         model,
         Examples(found.mixture, settings),

@@ -43,7 +43,7 @@ def test_mistakes_cost_what_they_should():
     one = tile()
     labels = np.zeros((S, S), np.int32)
     labels[20:40, 10:50], labels[120:140, 10:30], labels[160:170, 160:170] = 1, 2, 3
-    corners = one.corners.astype(float) + [[0, 0], [1, 1], [0, 0], [3, 0]]
+    corners = one.corners + np.array([[0, 0], [1, 1], [0, 0], [3, 0]])
     figures = chips.figures([one], [chips.Found(labels, np.array([0.9, 0.95, 0.99]), corners)])
     assert (figures["truth"], figures["predicted"]) == (2, 2)
     assert figures["pq"] == pytest.approx(1 / (1 + 0.5 + 0.5))
@@ -74,9 +74,9 @@ def test_methods_of_a_folder(tmp_path):
     assert found[2].settings["method"] == "two_stage"
     with pytest.raises(methods.NoModels):
         methods.of(tmp_path / "nowhere")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "both.onnx").write_bytes(b"x")
     with pytest.raises(contract.NotAModel):
-        (tmp_path / "bad").mkdir()
-        (tmp_path / "bad" / "both.onnx").write_bytes(b"x")
         methods.of(tmp_path / "bad")
 
 
