@@ -24,6 +24,7 @@ DEFAULTS = {
     "seed": 0,
     "tiles": 4000,
     "cities": [],
+    "leave_out": [],
     "validation": 0,
     "patience": 10,
     "shares": None,
@@ -81,8 +82,9 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
     options += [f"--family={train['family']}"]
     options += [f"--{key}={train[key]}" for key in ("data", "steps") if train[key] is not None]
-    if train["cities"]:
-        options += ["--cities", *map(str, train["cities"])]
+    for key in ("cities", "leave_out"):
+        if train[key]:
+            options += [f"--{key.replace('_', '-')}", *map(str, train[key])]
     if train["shares"]:
         options.append("--shares=" + ",".join(f"{k}={v}" for k, v in train["shares"].items()))
     if train["scene"]:

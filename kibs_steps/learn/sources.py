@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options that say what to learn from."""
     parser.add_argument("--data", help="data folder with roofgraph/roofgraph.tar and chips/; none: no photographs")
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
+    parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
     parser.add_argument("--own", nargs="*", default=[], help="folders of own samples (learn.own)")
     parser.add_argument("--pool", help="folder of simulated tiles, shared between runs (default: OUT/../pool)")
     parser.add_argument("--tiles", type=int, default=4000, help="simulated tiles to render into the pool (0: none)")
@@ -72,7 +73,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if args.data:
         data = Path(args.data)
         graphs = dataset.read_roof_graphs(args.roofgraph or data / "roofgraph" / "roofgraph.tar")
-        chips = dataset.read_chips(data / "chips")
+        chips = [c for c in dataset.read_chips(data / "chips") if c.name.split("/")[0] not in args.leave_out]
     own = [path for folder in args.own for path in sorted(Path(folder, "training").glob("[!.]*.npz"))]
     if args.own and not own:
         raise dataset.NoTrainingData(
@@ -118,7 +119,8 @@ def about(
     data = ["simulated scenes"] if args.tiles or args.pool else []
     data += [f"simulated scenes of the city in {Path(city).name}" for city in args.cities]
     data += ["roof-graph photographs (Ren et al. 2021), pasted"] if graphs else []
-    data += ["chips with building masks"] if chips else []
+    without = f", without {', '.join(args.leave_out)}" if args.leave_out else ""
+    data += [f"chips with building masks{without}"] if chips else []
     data += [f"own samples: {Path(folder).name}" for folder in args.own]
     licence = NON_COMMERCIAL if graphs or chips else OWN if args.own else SIMULATED
     found: dict[str, Any] = {"data": data, "licence": licence}
