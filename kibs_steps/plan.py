@@ -99,6 +99,7 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
+    settings = {**angles_of(settings), **settings}
     models = {
         task: contract.load(folder_of(settings["models"], base) / f"{task}.onnx", task)
         for task in ("sections", "corners")
@@ -143,6 +144,15 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings)
 
 
+def angles_of(settings: dict[str, Any]) -> dict[str, float]:
+    """The angles that the scene's `metadata` tells, by their keys; what is set itself comes before them."""
+    if not settings.get("metadata"):
+        return {}
+    from kibs_steps import metadata
+
+    return {key: value for key, value in metadata.read(settings["metadata"])._asdict().items() if value is not None}
+
+
 def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) -> list[str]:
     """What the models say of the scene's angles; raises `contract.AngleOutsideTraining` where they refuse them."""
 
@@ -185,7 +195,7 @@ def signatures(
         value = settings.get(key)
         return fingerprint.of_file(value, cache) if value and Path(value).is_file() else value
 
-    angles = some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation")
+    angles = [some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"), content("regions")]
     seen = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
     s = {"source": h(version("kibs-steps"), source)}
     s["scene"] = h(

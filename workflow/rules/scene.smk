@@ -53,6 +53,7 @@ rule scene:
             "bands",
             "aoi",
             "vertical_crs",
+            "regions",
         ),
     shell:
         "python -m kibs_steps.scene --name {wildcards.scene:q} --raster {input.raster:q} --dtm={params.dtm:q}"
