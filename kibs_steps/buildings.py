@@ -51,7 +51,8 @@ def buildings(
     """Building id (n,) and cluster id (n,) of each section.
 
     `ids` (n,) section ids; `outlines` (n,) polygons, map frame (m); `planes` (n, 5) as a, b, c, x0, y0 of
-    z = a(x−x0) + b(y−y0) + c; `lean` of the view, one or (n, 2); `footprint` (n,) number of the footprint each section stands in, −1 none.
+    z = a(x−x0) + b(y−y0) + c; `lean` of the view, one or (n, 2); `footprint` (n,) number of the
+    footprint each section stands in, −1 none.
     """
     order = np.argsort(ids, kind="stable")
     flat = shapely.force_2d(outlines[order])
@@ -90,7 +91,10 @@ def hidden(lean: Lean) -> float:
 def shared_edges(
     outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray, lean: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Length (m) of the edge that each pair (m, 2) of sections shares, and the mean height of the step along it (m); `lean` (n, 2)."""
+    """Length (m) of the edge that each pair (m.
+
+    2) of sections shares, and the mean height of the step along it (m); `lean` (n, 2).
+    """
     parts, section = shapely.get_parts(outlines, return_index=True)
     rings, part = shapely.get_rings(shapely.orient_polygons(parts), return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)

@@ -1,12 +1,15 @@
 """Metadata: the directions to satellite and sun as an image's vendor gives them.
 
-In: one file, told apart by its content: Maxar/WorldView `.IMD` or its XML twin, Airbus DIMAP XML (Pléiades, SPOT), a STAC item, or rational
-polynomial coefficients (`.RPB`, `_RPC.TXT`, or a raster that carries them). Out: `Angles` after PAPER's conventions: azimuths clockwise
+In: one file, told apart by its content: Maxar/WorldView `.IMD` or its XML twin, Airbus DIMAP XML (Pléiades, SPOT), a STAC
+item, or rational
+polynomial coefficients (`.RPB`, `_RPC.TXT`, or a raster that carries them). Out: `Angles` after PAPER's conventions: azimuths
+clockwise
 from true north **from the target**, elevations above the horizon at the target.
 
 Vendors word these angles differently:
 - Maxar: `meanSatAz`, `meanSatEl` (older: `satAz`, `satEl`) are what is wanted.
-- DIMAP: `INCIDENCE_ANGLE` is measured at the target, so elevation = 90° − it. `AZIMUTH_ANGLE` is the direction of the *image's lines*; the
+- DIMAP: `INCIDENCE_ANGLE` is measured at the target, so elevation = 90° − it. `AZIMUTH_ANGLE` is the direction of the *image's
+lines*; the
   satellite stands at that minus atan2(tan across-track, tan along-track incidence), as the Orfeo ToolBox and ACOLITE have it.
 - STAC: `view:azimuth` is worded from the sub-satellite point to the scene, the satellite is at 180° more; `view:off_nadir` is
   measured at the sensor and is not used, but must agree with `view:incidence_angle`.
@@ -156,7 +159,7 @@ def of_stac(item: dict[str, Any], path: Path) -> Angles:
         low, high = (incidence_of(off_nadir, height) for height in ORBITS)
         if not low - 2.0 <= incidence <= high + 2.0:
             raise MetadataUnusable(
-                f"metadata {path} contradicts itself: view:off_nadir {off_nadir:g}° goes with an incidence of {low:.1f}–{high:.1f}°, "
+                f"metadata {path} contradicts itself: view:off_nadir {off_nadir:g}° goes with {low:.1f}–{high:.1f}° of incidence, "
                 f"but view:incidence_angle is {incidence:g}° (some vendors write the elevation there): {_HELP}"
             )
     return Angles(

@@ -29,6 +29,7 @@ DEFAULTS = {
     "truth_z": "absolute",
     "allow_angles": False,
     "lod_label": "2.0",
+    "drape": False,
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
 REACH = 7.5  # px: half the paper's corner square q = 15, unless the model's contract says otherwise
@@ -214,10 +215,20 @@ def signatures(
     s["corners"] = h(s["blend"], seen["corners"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.
-    s["stitch"] = h(s["feed"] if settings["feed"] == "truth" else s["corners"], models["corners"].sha256)
-    s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
+    found = s["feed"] if settings["feed"] == "truth" else s["sections"] if settings.get("dsm") else s["corners"]
+    s["stitch"] = h(found, models["corners"].sha256)
+    s["edited"] = h(s["stitch"], s["scene"], content("sections")) if settings.get("sections") else s["stitch"]
+    s["surface"] = h(s["scene"], content("dsm"))
+    s["planes"] = h(
+        s["edited"],
+        s["scene"],
+        models["corners"].sha256,
+        settings["planes"],
+        s["surface"] if settings.get("dsm") else None,
+    )
     s["buildings"] = h(s["planes"], content("footprints"))
     s["solids"] = h(s["buildings"], settings["lod_label"])
     s["evaluate"] = h(s["planes"], s["truth"])
+    s["glb"] = h(s["solids"], settings["drape"])
     s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
     return s

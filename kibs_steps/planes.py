@@ -297,6 +297,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--model", required=True, help="models/corners.json: mean height where no corner is found")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--rule", choices=["robust", "paper"], default="robust")
+    parser.add_argument("--surface", help="surface.tif: heights come from there, not from corners")
     parser.add_argument("--planes", required=True, help="out: planes.parquet")
     parser.add_argument("--filed", required=True, help="out: filed_corners.parquet")
     args = parser.parse_args(argv)
@@ -305,6 +306,10 @@ def main(argv: list[str] | None = None) -> None:
     sections, corners = (store.read_table(f, block=args.name) for f in (args.sections, args.corners))
     dtm = facts.terrain(map_bounds(sections, facts))
     fallback = (heights["fallback"], heights.get("fallback_sigma", 3.0))
+    if args.surface:
+        from kibs_steps import surface
+
+        sections, corners = surface.under(sections, facts, args.surface, dtm)
     table, filed = planes(sections, corners, facts, dtm, fallback, args.reach, args.rule)
     store.write_table(args.planes, table)
     store.write_table(args.filed, filed)

@@ -67,7 +67,8 @@ class Region(NamedTuple):
 class Scene(NamedTuple):
     """What every later step needs to know; `view` and `sun` are None when unknown.
 
-    `regions` have a view of their own; `view` holds outside them. `stretch` is (low, high, gamma) per band, `nodata` the value that marks missing data in all bands
+    `regions` have a view of their own; `view` holds outside them. `stretch` is (low, high, gamma) per band, `nodata` the value
+    that marks missing data in all bands
     (`imagery.stretch_of`, `imagery.nodata_of`).
     """
 

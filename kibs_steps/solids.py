@@ -2,7 +2,8 @@
 
 In: the block's rows of `buildings.parquet`, the DTM. Out: CityJSONSeq (a header line, then one feature per building) and
 `solids.parquet`, the building attributes. Buildings that touch (a cluster) are tiled as one, so their party walls are the same
-faces; then each is made by itself. It is tried as a roof of fused planes (LOD2), then with roofs that dive into the ground cut there, then with every section flat
+faces; then each is made by itself. It is tried as a roof of fused planes (LOD2), then with roofs that dive into the ground cut
+there, then with every section flat
 at its mean height (1.3), then as one flat block (1.2); the first whose shells all pass `gate.check` is published, and
 `lod_reason` says what was refused before it. Where none passes the building stays, LOD "0", as its footprint.
 """
@@ -42,9 +43,9 @@ class Refused(KibsError):
 
 
 class Sections(NamedTuple):
-    """The sections of one building, or of several that touch: ids, polygons and planes (n, 3: z = a·x + b·y + c) in metres from `origin` (map m).
+    """The sections of one building, or of several that touch.
 
-    `traced`: their outlines run from pixel corner to pixel corner, so their rims are ragged. `spread` (n,): σ of where they stand
+    Ids, polygons and planes (n, 3: z = a·x + b·y + c) in metres from `origin` (map m). `traced`: their outlines run from pixel corner to pixel corner, so their rims are ragged. `spread` (n,): σ of where they stand
     (m), NaN where the view is unknown.
     """
 

@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from kibs_steps import cli, scene, store
+from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Block, Grid, Tiling
 from kibs_steps.sections import links_across
 
@@ -243,6 +244,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--tolerance", type=float, required=True, help="smoothing of pixel outlines, px; 0 for none")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
+    parser.add_argument("--without-corners", action="store_true", help="no corners were looked for")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
     parser.add_argument("--corners", required=True, help="out: corners of all blocks")
     args = parser.parse_args(argv)
@@ -255,7 +257,7 @@ def main(argv: list[str] | None = None) -> None:
         [store.read_table(f / "pieces.parquet") for f in folders],
         [store.read_table(f / "links.parquet") for f in folders],
         [store.read_arrays(f / "seams.npz") for f in folders],
-        [store.read_table(f / "corners.parquet") for f in folders],
+        [CORNERS.empty_table() if args.without_corners else store.read_table(f / "corners.parquet") for f in folders],
         facts.grid,
         tiling,
         args.tolerance,
