@@ -45,8 +45,9 @@ class Refused(KibsError):
 class Sections(NamedTuple):
     """The sections of one building, or of several that touch.
 
-    Ids, polygons and planes (n, 3: z = a·x + b·y + c) in metres from `origin` (map m). `traced`: their outlines run from pixel corner to pixel corner, so their rims are ragged. `spread` (n,): σ of where they stand
-    (m), NaN where the view is unknown.
+    Ids, polygons and planes (n, 3: z = a·x + b·y + c) in metres from `origin` (map m). `traced`: their outlines
+    run from pixel corner to pixel corner, so their rims are ragged. `spread` (n,): σ of where they stand (m), NaN where the
+    view is unknown.
     """
 
     ids: np.ndarray

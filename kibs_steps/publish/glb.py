@@ -10,6 +10,9 @@ take it where each of their corners is *seen*.
 from __future__ import annotations
 
 import argparse
+import io
+import json
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -68,8 +71,7 @@ def city(found: Iterable[Mesh], origin: np.ndarray, extra: dict[str, Any], drape
     world = trimesh.Scene(metadata=extra)
     material = None
     if drape is not None:
-        rgb, _ = picture.overview(drape, LONGEST)
-        material = PBRMaterial("image", baseColorTexture=Image.fromarray(rgb), metallicFactor=0.0, roughnessFactor=1.0)
+        material = PBRMaterial("image", baseColorTexture=photograph(drape), metallicFactor=0.0, roughnessFactor=1.0)
         dtm = drape.terrain(drape.grid.bounds)
     for mesh in found:
         base = np.floor(mesh.triangles.reshape(-1, 3).min(axis=0))
@@ -86,6 +88,14 @@ def city(found: Iterable[Mesh], origin: np.ndarray, extra: dict[str, Any], drape
     return trimesh.exchange.gltf.export_glb(world, include_normals=False, tree_postprocessor=matt)
 
 
+def photograph(scene: Scene) -> Image.Image:
+    """The scene's image as a JPEG of at most `LONGEST` px."""
+    rgb, _ = picture.overview(scene, min(LONGEST, max(scene.grid.width, scene.grid.height)))
+    content = io.BytesIO()
+    Image.fromarray(rgb).save(content, "JPEG", quality=88)
+    return Image.open(content)
+
+
 def matt(tree: dict[str, Any]) -> None:
     """Give every part without a material a matt one: glTF's own default is a mirror."""
     bare = [p for mesh in tree.get("meshes", []) for p in mesh["primitives"] if "material" not in p]
@@ -97,9 +107,6 @@ def matt(tree: dict[str, Any]) -> None:
 
 def empty(extra: dict[str, Any]) -> bytes:
     """A GLB without any building."""
-    import json
-    import struct
-
     text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"extras": extra}]}).encode()
     text += b" " * (-len(text) % 4)
     return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
