@@ -159,7 +159,7 @@ def of_stac(item: dict[str, Any], path: Path) -> Angles:
         low, high = (incidence_of(off_nadir, height) for height in ORBITS)
         if not low - 2.0 <= incidence <= high + 2.0:
             raise MetadataUnusable(
-                f"metadata {path} contradicts itself: view:off_nadir {off_nadir:g}° goes with {low:.1f}–{high:.1f}° of incidence, "
+                f"metadata {path} contradicts itself: view:off_nadir {off_nadir:g}° goes with {low:.1f}–{high:.1f}°, "
                 f"but view:incidence_angle is {incidence:g}° (some vendors write the elevation there): {_HELP}"
             )
     return Angles(

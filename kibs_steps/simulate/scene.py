@@ -11,6 +11,7 @@ Run as a program it writes one scene: `scene.tif`, `dtm.tif`, `truth.gpkg`, `ang
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,13 +23,20 @@ from kibs_steps import view as geometry
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction, convergence
-from kibs_steps.simulate import camera, light
+from kibs_steps.simulate import camera, citymodel, light, real
 from kibs_steps.simulate.city import MIXTURES, STYLES, procedural
-from kibs_steps.simulate.site import CLUTTER, ROOF, City
+from kibs_steps.simulate.citymodel import CityModel
+from kibs_steps.simulate.site import CLUTTER, ROOF, WALL, City, pick
 from kibs_steps.terrain import Terrain, flat
 
 STRIP = 256  # rows shaded at a time
 BIAS = 0.2  # m: a face this little above another does not shade it
+# What a pixel shows first: furniture of a roof counts as roof; ground the sun does not reach is a surface of its own.
+GROUND, ON_ROOF, ON_WALL, OTHER, SHADED_GROUND = range(5)
+
+
+# Azimuth, elevation and half angle (deg) of views that random scenes never show: models are judged there.
+HELD_OUT_CONE = (250.0, 62.0, 5.0)
 
 
 class SectionTruth(NamedTuple):
@@ -49,6 +57,7 @@ class Rendering(NamedTuple):
     rgb: np.ndarray
     section: np.ndarray
     height: np.ndarray
+    surface: np.ndarray
     sections: list[SectionTruth]
     corners: np.ndarray
     corner_heights: np.ndarray
@@ -169,16 +178,17 @@ def render(
     """Render a city on its terrain.
 
     Returns `rgb` uint8 (h, w, 3); `section` int32 (h, w), the visible section or 0; `height` float32 (h, w), m above ground at
-    the true position, NaN off sections; `sections`, the truth of all sections whose image meets the grid; `corners` float32
-    (n, 2) px col, row of section corners that can be seen, with `corner_heights` (n,) m above ground and `corner_sections`
-    (n,). `backgrounds`: photographs of ground, uint8 (h, w, 3), each with a mask of its usable pixels, bool (h, w); drawn
-    over parts of the painted ground. `look`: the camera, drawn if None.
+    the true position, NaN off sections; `surface` uint8 (h, w), the kind of what is seen (GROUND …); `sections`, the truth of
+    all sections whose image meets the grid; `corners` float32 (n, 2) px col, row of section corners that can be seen, with
+    `corner_heights` (n,) m above ground and `corner_sections` (n,). `backgrounds`: photographs of ground, uint8 (h, w, 3),
+    each with a mask of its usable pixels, bool (h, w); drawn over parts of the painted ground. `look`: the camera, drawn if
+    None.
     """
     samples = _sample_frame(grid)
     city = _near(city, terrain, samples, view.lean, sun.lean)
     seen = _see(city, terrain, samples, view.lean)
     sections = _truth(city, terrain, grid, view.lean, seen.section)
-    shine = _shine(city, seen, samples, sun, rng, sections, backgrounds)
+    shine, lit = _shine(city, seen, samples, sun, rng, sections, backgrounds)
     rgb = camera.photograph(shine, look or camera.camera(rng), rng)
 
     at = np.s_[1::2, 1::2]
@@ -192,7 +202,16 @@ def render(
         true_at = seen_at + (z[on] - terrain(seen_at))[:, None] * np.array(view.lean)
         height[on] = z[on] - terrain(true_at)
     corners = _corners(sections, section)
-    return Rendering(rgb, section, height, sections, *corners)
+    return Rendering(rgb, section, height, _surface(city, seen.face[at], lit[at]), sections, *corners)
+
+
+def _surface(city: City, face: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Kind of surface, uint8, of the faces seen (−1 ground) and whether the sun reaches them."""
+    of_kind = {ROOF: ON_ROOF, CLUTTER: ON_ROOF, WALL: ON_WALL}
+    table = np.array([of_kind.get(f.kind, OTHER) for f in city.faces] + [GROUND], np.uint8)
+    surface = table[face]
+    surface[(face < 0) & (lit == 0)] = SHADED_GROUND
+    return surface
 
 
 def _shine(
@@ -203,8 +222,8 @@ def _shine(
     rng: np.random.Generator,
     sections: list[SectionTruth],
     backgrounds: list[tuple[np.ndarray, np.ndarray]] | None,
-) -> np.ndarray:
-    """Radiance (rows, cols, 3) float32 of all samples, worked out in strips of rows to bound the memory."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance (rows, cols, 3) of all samples, in strips of rows to bound the memory, and where the sun shines (0, 1)."""
     # Textures in float32 need small coordinates: an origin near by.
     origin = np.array([samples.x0, samples.y0, 0.0])
     near = city._replace(faces=[f._replace(ring=f.ring - origin) for f in city.faces])
@@ -236,7 +255,7 @@ def _shine(
             source,
         )
         shine[rows] = light_here.reshape(-1, shape[1], 3)
-    return shine
+    return shine, lit
 
 
 def _rims(city: City, sections: list[SectionTruth], shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
@@ -299,7 +318,7 @@ def _photograph(
 
 def _truth(city: City, terrain: Terrain, grid: Grid, k: tuple[float, float], seen: np.ndarray) -> list[SectionTruth]:
     counts = np.bincount(seen.ravel())
-    roofs = [f for f in city.faces if f.kind == ROOF]
+    roofs = [f for f in city.faces if f.kind == ROOF and f.section]
     if not roofs:
         return []
     rings = [ring for f in roofs for ring in (f.ring, *f.holes)]
@@ -386,6 +405,17 @@ def _roofs_within(city: City, side: float) -> int:
     return sum(f.kind == ROOF and 0 < f.ring[0, 0] < side and 0 < f.ring[0, 1] < side for f in city.faces)
 
 
+def _random_view(rng: np.random.Generator, low: float, high: float) -> tuple[float, float]:
+    """Azimuth and elevation (deg) of a satellite, oblique views more often than steep ones, never within HELD_OUT_CONE."""
+    while True:
+        azimuth = rng.uniform(0, 360)
+        elevation = min(rng.triangular(low, low + 0.3 * (high - low), high) if high > low else low, 89.9)
+        held_azimuth, held_elevation, cone = HELD_OUT_CONE
+        off = abs((azimuth - held_azimuth + 180) % 360 - 180)
+        if high == low or np.hypot(off * np.cos(np.radians(held_elevation)), elevation - held_elevation) > cone:
+            return azimuth, elevation
+
+
 def random_scene(
     rng: np.random.Generator,
     size: int = 256,
@@ -394,23 +424,38 @@ def random_scene(
     sun_elevation: tuple[float, float] = (20, 70),
     backgrounds: list[tuple[np.ndarray, np.ndarray]] | None = None,
     style: str | None = None,
+    cities: Sequence[CityModel] = (),
+    city_share: float = 0.3,
 ) -> tuple[Rendering, np.ndarray]:
-    """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md)."""
+    """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md).
+
+    `city_share` of the tiles show a part of one of the real `cities`, if there are any; the others are procedural, of one `style`
+    or of any.
+    """
     side = size * gsd
     grid = Grid("", 0.0, side, gsd, size, size)
-    view = _direction(rng.uniform(0, 360), min(rng.uniform(*view_elevation), 89.9))
+    view = _direction(*_random_view(rng, *view_elevation))
     sun = _direction(rng.uniform(0, 360), rng.uniform(*sun_elevation))
-    style = style or str(rng.choice([*STYLES, "mixed"], p=[0.2, 0.15, 0.11, 0.12, 0.09, 0.08, 0.02, 0.05, 0.05, 0.13]))
+    style = style or str(
+        rng.choice([*STYLES, "mixed", "town"], p=[0.18, 0.13, 0.1, 0.11, 0.09, 0.08, 0.02, 0.05, 0.05, 0.11, 0.08])
+    )
     margin = 25.0 + (15.0 if style in ("centre", "perimeter") else 0.0)
     terrain = flat(0.0)
     if rng.random() < 0.35:
         low, high = -margin - 60, side + margin + 60
         terrain = relief(rng, (low, low, high, high), 2.0, rng.uniform(0, 6), rng.uniform(0, 0.15))
     wide = side + 2 * margin
-    city = procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+    model = pick(rng, cities) if len(cities) and rng.random() < city_share else None
+
+    def build() -> City:
+        if model:
+            return real.city(rng, model, (-margin, -margin, wide - margin, wide - margin), terrain)
+        return procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+
+    city = build()
     # Tiles with hardly a roof teach little: most of them are drawn again.
     while _roofs_within(city, side) < 4 and rng.random() < 0.75:
-        city = procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+        city = build()
     picture = render(city, terrain, grid, view, sun, rng, backgrounds if rng.random() < 0.5 else None)
     return picture, geometry_vector(view, sun, gsd)
 
@@ -424,15 +469,22 @@ def simulate(
     amplitude: float = 0.0,
     slope: float = 0.0,
     base: float = 100.0,
+    model: CityModel | None = None,
 ) -> tuple[Rendering, Terrain]:
     """One scene over `grid`: its rendering and its terrain (2 m posting, 250 m beyond the grid).
 
-    `amplitude` (m) and `slope` (m/m) shape the terrain, `base` (m) is its mean height.
+    `amplitude` (m) and `slope` (m/m) shape the terrain, `base` (m) is its mean height. With a `model` the scene shows that
+    city where it stands, on its own terrain.
     """
     rng = np.random.default_rng(seed)
     left, bottom, right, top = grid.bounds
-    terrain = relief(rng, (left - 250, bottom - 250, right + 250, top + 250), 2.0, amplitude, slope, base)
+    around = (left - 250, bottom - 250, right + 250, top + 250)
     margin = 60.0
+    if model:
+        terrain = real.surveyed_terrain(model, around, 2.0)
+        within = (left - margin, bottom - margin, right + margin, top + margin)
+        return render(real.as_surveyed(rng, model, within, terrain), terrain, grid, view, sun, rng), terrain
+    terrain = relief(rng, around, 2.0, amplitude, slope, base)
     city = procedural(
         rng, right - left + 2 * margin, top - bottom + 2 * margin, terrain, style, (left - margin, bottom - margin)
     )
@@ -506,8 +558,9 @@ def _write_raster(path: Path, values: np.ndarray, crs: str, x0: float, y0: float
         target.write(bands)
 
 
-def _origin(crs: str, gsd: float) -> tuple[float, float]:
-    """An upper-left corner near the centre of a CRS's area of use, on a multiple of the GSD (millimetres kept)."""
+def _origin(crs: str, gsd: float, size: int, model: CityModel | None) -> tuple[float, float]:
+    """An upper-left corner on a multiple of the GSD (millimetres kept): near the centre of the CRS's area of use, or so that
+    the middle of the city model's buildings is in the middle."""
     import pyproj
 
     try:
@@ -518,6 +571,9 @@ def _origin(crs: str, gsd: float) -> tuple[float, float]:
         ) from error
     if not system.is_projected or abs(system.axis_info[0].unit_conversion_factor - 1) > 1e-9:
         raise UnusableScene(f"--crs {crs} is not projected in metres: give a UTM zone, such as EPSG:32631")
+    if model:
+        x, y = np.median([b.centre for b in model.buildings], axis=0) + size * gsd / 2 * np.array([-1.0, 1.0])
+        return round(round(x / gsd) * gsd, 3), round(round(y / gsd) * gsd, 3)
     west, south, east, north = system.area_of_use.bounds if system.area_of_use else (2.0, 48.0, 4.0, 50.0)
     latitude = 49.2 if south < 49.2 < north else (south + north) / 2
     x, y = pyproj.Transformer.from_crs(system.geodetic_crs, system, always_xy=True).transform(
@@ -543,7 +599,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--style", choices=[*STYLES, *MIXTURES], default="mixed")
     parser.add_argument("--relief", type=float, default=0.0, help="amplitude of the terrain's waves in metres")
     parser.add_argument("--slope", type=float, default=0.0, help="slope of the terrain in percent")
-    parser.add_argument("--crs", default="EPSG:32631", help="a projected CRS in metres")
+    parser.add_argument(
+        "--city", type=Path, help="a CityJSON or CityJSONSeq file to show, where it stands, on its own ground"
+    )
+    parser.add_argument("--crs", default="EPSG:32631", help="a projected CRS in metres; a city file's own comes first")
     parser.add_argument("--out", type=Path, required=True, help="folder to write to")
     args = parser.parse_args(argv)
     if args.size < 1 or not args.gsd > 0:
@@ -551,17 +610,19 @@ def main(argv: list[str] | None = None) -> None:
     for name, least in (("view", 20), ("sun", 5)):
         if not least <= getattr(args, f"{name}_elevation") <= 90:
             raise UnusableScene(f"--{name}-elevation must be between {least} and 90 degrees")
-    grid = Grid(args.crs, *_origin(args.crs, args.gsd), args.gsd, args.size, args.size)
+    model = citymodel.read(args.city) if args.city else None
+    crs = model.crs if model and model.crs else args.crs
+    grid = Grid(crs, *_origin(crs, args.gsd, args.size, model), args.gsd, args.size, args.size)
     turned = convergence(grid)
     view = _direction(args.view_azimuth, args.view_elevation, turned)
     sun = _direction(args.sun_azimuth, args.sun_elevation, turned)
-    picture, terrain = simulate(args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0)
+    picture, terrain = simulate(args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0, model=model)
     step = terrain.step[0]
-    _write_raster(args.out / "scene.tif", picture.rgb, args.crs, grid.x0, grid.y0, grid.gsd)
+    _write_raster(args.out / "scene.tif", picture.rgb, crs, grid.x0, grid.y0, grid.gsd)
     _write_raster(
         args.out / "dtm.tif",
         terrain.heights.astype(np.float32),
-        args.crs,
+        crs,
         terrain.x0 - step / 2,
         terrain.y0 + step / 2,
         step,
