@@ -19,6 +19,7 @@ from kibs_steps.scene import Direction, convergence
 from kibs_steps.simulate import citymodel, real
 from kibs_steps.simulate.city import MIXTURES, STYLES, procedural
 from kibs_steps.simulate.citymodel import CityModel
+from kibs_steps.simulate.draped import House
 from kibs_steps.simulate.rendering import Rendering, render
 from kibs_steps.simulate.site import ROOF, City, pick
 from kibs_steps.terrain import Terrain, flat
@@ -87,11 +88,13 @@ def random_scene(
     style: str | None = None,
     cities: Sequence[CityModel] = (),
     city_share: float = 0.3,
+    houses: Sequence[House] = (),
+    house_share: float = 0.2,
 ) -> tuple[Rendering, np.ndarray]:
     """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md).
 
     `city_share` of the tiles show a part of one of the real `cities`, if there are any; the others are procedural, of one `style`
-    or of any.
+    or of any, `house_share` of them with photographed `houses`, if there are any.
     """
     side = size * gsd
     grid = Grid("", 0.0, side, gsd, size, size)
@@ -107,11 +110,14 @@ def random_scene(
         terrain = relief(rng, (low, low, high, high), 2.0, rng.uniform(0, 6), rng.uniform(0, 0.15))
     wide = side + 2 * margin
     model = pick(rng, cities) if len(cities) and rng.random() < city_share else None
+    stock = houses if len(houses) and not model and rng.random() < house_share else ()
+    if len(stock):
+        style = pick(rng, ("suburb", "suburb", "suburb", "village", "town", "farm"))
 
     def build() -> City:
         if model:
             return real.city(rng, model, (-margin, -margin, wide - margin, wide - margin), terrain)
-        return procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+        return procedural(rng, wide, wide, terrain, style, (-margin, -margin), stock)
 
     city = build()
     # Tiles with hardly a roof teach little: most of them are drawn again.

@@ -60,6 +60,7 @@ def radiance_of(
         which = index[rows].ravel()
         points = (seen.points[rows] - origin).astype(np.float32).reshape(-1, 3)
         colour = light.albedo(which, points, table, city.materials, rng)
+        _drape(city, which, points, origin, colour)
         if photograph:
             chosen = (which >= len(city.faces)) & photograph[1][rows].ravel()
             colour[chosen] = photograph[0][rows].reshape(-1, 3)[chosen]
@@ -73,6 +74,25 @@ def radiance_of(
         )
         shine[rows] = light_here.reshape(-1, shape[1], 3)
     return shine, lit
+
+
+def _drape(city: City, which: np.ndarray, points: np.ndarray, origin: np.ndarray, colour: np.ndarray) -> None:
+    """Give samples (n,) of faces with photographs their colours, in place; `points` (n, 3) are m from `origin`."""
+    if not len(city.photographs):
+        return
+    owner = np.array([f.photograph for f in city.faces] + [-1] * len(city.paints))[which]
+    for i in np.unique(owner[owner >= 0]).tolist():
+        some = np.flatnonzero(owner == i)
+        picture = city.photographs[i]
+        at = points[some, :2] @ picture.onto[:, :2].T + (picture.onto[:, 2] + picture.onto[:, :2] @ origin[:2]) - 0.5
+        limit = np.array(picture.rgb.shape[1::-1]) - 1.001
+        at = np.clip(at, 0, limit)
+        col, row = at.astype(np.int32).T
+        u, v = (at - np.floor(at)).T[..., None]
+        p = picture.rgb.astype(np.float32)
+        top, low = p[row, col] * (1 - u) + p[row, col + 1] * u, p[row + 1, col] * (1 - u) + p[row + 1, col + 1] * u
+        mixed = (top * (1 - v) + low * v) / 255
+        colour[some] *= 0.75 * mixed ** (2.0 * picture.gamma)
 
 
 def _lit(city: City, seen: Seen, samples: Grid, sun: tuple[float, float], facing: np.ndarray) -> np.ndarray:

@@ -43,6 +43,16 @@ class Face(NamedTuple):
     building: int = 0
     material: int = 0
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    photograph: int = -1  # index into the city's photographs, −1 none
+
+
+class Photograph(NamedTuple):
+    """A photograph taken from above, uint8 (h, w, 3), draped over faces: `onto` (2, 3) gives px (col, row) of map metres;
+    `gamma` is how its values are stretched."""
+
+    rgb: np.ndarray
+    onto: np.ndarray
+    gamma: float = 1.0
 
 
 class Paint(NamedTuple):
@@ -55,11 +65,12 @@ class Paint(NamedTuple):
 
 
 class City(NamedTuple):
-    """Faces, ground paints and the materials both index."""
+    """Faces, ground paints and the materials both index; the photographs faces index."""
 
     faces: list[Face]
     paints: list[Paint]
     materials: list[Material]
+    photographs: Sequence[Photograph] = ()
 
 
 class Place(NamedTuple):
@@ -126,6 +137,7 @@ class Site:
         self.rng, self.terrain, self.kit, self.area = rng, terrain, kit, area
         self.faces: list[Face] = []
         self.paints: list[Paint] = []
+        self.photographs: list[Photograph] = []
         self.sections = 0
         self.buildings = 0
         self.level = bool(np.ptp(terrain.heights) == 0)
