@@ -25,6 +25,7 @@ from kibs_steps.simulate.site import ROOF, WALL, Face, Photograph, Place, Site, 
 
 EAVE = 75.0  # the data set's nominal height of eaves, in px of the original photograph like x and y
 PLANAR = 0.01  # m: a house with corners farther off their face's plane is left out
+LEAST = 0.05  # m² in plan: smaller faces are none
 EVEN = 0.6  # how far the faces' brightness is brought together: 0 not at all, 1 wholly
 
 
@@ -92,10 +93,12 @@ def lift(graph: RoofGraph, nominal: np.ndarray) -> House | None:
     for face in graph.faces:
         ring = points[face]
         area = roofs.area(ring[:, :2].tolist())
+        if abs(area) < LEAST:  # upright gable ends: walls will stand there
+            continue
         ring = ring if area > 0 else ring[::-1]
         design = np.column_stack([ring[:, :2] - ring[:, :2].mean(0), np.ones(len(ring))])
         plane = np.linalg.lstsq(design, ring[:, 2], rcond=None)[0]
-        if abs(area) < 0.3 or np.abs(design @ plane - ring[:, 2]).max() > PLANAR:
+        if np.abs(design @ plane - ring[:, 2]).max() > PLANAR:
             return None
         mask = cv2.fillPoly(
             np.zeros(brightness.shape, np.uint8),
@@ -107,6 +110,8 @@ def lift(graph: RoofGraph, nominal: np.ndarray) -> House | None:
         seen.append(float(brightness[mask > 0].mean()) if mask.any() else 0.0)
         slopes.append(float(np.hypot(*plane[:2])))
         areas.append(abs(area))
+    if not rings:
+        return None
     whole = np.average(seen, weights=areas)
     slope = float(np.average(slopes, weights=areas))
     if whole <= 0 or slope < 0.02:
