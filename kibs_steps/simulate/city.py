@@ -13,6 +13,7 @@ import numpy as np
 
 from kibs_steps.simulate import blocks, draped, roofs
 from kibs_steps.simulate.draped import House
+from kibs_steps.simulate.outdoors import add_decoys, street
 from kibs_steps.simulate.site import City, Site, pick
 from kibs_steps.simulate.surfaces import palette
 from kibs_steps.terrain import Terrain
@@ -87,9 +88,9 @@ def lay_out(site: Site, style: str, houses: Sequence[House] = ()) -> None:
 
     ss, ts = cuts(long0, long1), cuts(deep0, deep1)
     for (_, a), (b, _) in pairwise(ss):
-        blocks.street(site, a, ts[0][0], b, ts[-1][1])
+        street(site, a, ts[0][0], b, ts[-1][1])
     for (_, a), (b, _) in pairwise(ts):
-        blocks.street(site, ss[0][0], a, ss[-1][1], b)
+        street(site, ss[0][0], a, ss[-1][1], b)
     decoys = pick(rng, [0.0, 0.5])
     green = 0.12 if style != "farm" else 0.02
     corner = 0.5 * np.hypot(width, height)
@@ -110,4 +111,4 @@ def lay_out(site: Site, style: str, houses: Sequence[House] = ()) -> None:
             else:
                 blocks.FILL[name](site, s0, t0, s1, t1)
             if rng.random() < decoys:
-                blocks.add_decoys(site, s0, t0, s1, t1)
+                add_decoys(site, s0, t0, s1, t1)
