@@ -14,7 +14,8 @@ import numpy as np
 from kibs_steps.simulate import blocks, draped, roofs
 from kibs_steps.simulate.draped import House
 from kibs_steps.simulate.outdoors import add_decoys, street
-from kibs_steps.simulate.site import City, Site, pick
+from kibs_steps.simulate.pieces import City, pick
+from kibs_steps.simulate.site import Site
 from kibs_steps.simulate.surfaces import palette
 from kibs_steps.terrain import Terrain
 

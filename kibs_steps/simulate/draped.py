@@ -21,7 +21,8 @@ import numpy as np
 
 from kibs_steps.learn.dataset import GRAPH_GSD, REDUCED, NoTrainingData, RoofGraph
 from kibs_steps.simulate import roofs
-from kibs_steps.simulate.site import ROOF, WALL, Face, Photograph, Place, Site, pick
+from kibs_steps.simulate.pieces import ROOF, WALL, Face, Photograph, Place, pick
+from kibs_steps.simulate.site import Site
 
 EAVE = 75.0  # the data set's nominal height of eaves, in px of the original photograph like x and y
 PLANAR = 0.01  # m: a house with corners farther off their face's plane is left out

@@ -6,8 +6,9 @@ import numpy as np
 
 from kibs_steps.simulate import roofs
 from kibs_steps.simulate.houses import blob, church, hedge, house
+from kibs_steps.simulate.pieces import pick
 from kibs_steps.simulate.roofs import wing
-from kibs_steps.simulate.site import Site, pick
+from kibs_steps.simulate.site import Site
 
 
 def suburb(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:

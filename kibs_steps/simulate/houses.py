@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from kibs_steps.simulate import roofs
+from kibs_steps.simulate.pieces import TREE, Place, pick
 from kibs_steps.simulate.roofs import Wing, wing
-from kibs_steps.simulate.site import TREE, Place, Site, pick
+from kibs_steps.simulate.site import Site
 
 
 def _wings(

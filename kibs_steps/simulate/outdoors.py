@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from kibs_steps.simulate import roofs
-from kibs_steps.simulate.site import Site, pick
+from kibs_steps.simulate.pieces import pick
+from kibs_steps.simulate.site import Site
 
 
 def parking(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:

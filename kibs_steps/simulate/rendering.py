@@ -16,8 +16,8 @@ from kibs_steps import zbuffer
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction
 from kibs_steps.simulate import camera, shading
+from kibs_steps.simulate.pieces import CLUTTER, ROOF, WALL, City
 from kibs_steps.simulate.shading import Seen
-from kibs_steps.simulate.site import CLUTTER, ROOF, WALL, City
 from kibs_steps.simulate.truth import SectionTruth, sample_frame, section_truths, visible_corners
 from kibs_steps.terrain import Terrain
 

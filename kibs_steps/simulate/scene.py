@@ -20,8 +20,8 @@ from kibs_steps.simulate import citymodel, real
 from kibs_steps.simulate.city import MIXTURES, STYLES, procedural
 from kibs_steps.simulate.citymodel import CityModel
 from kibs_steps.simulate.draped import House
+from kibs_steps.simulate.pieces import ROOF, City, pick
 from kibs_steps.simulate.rendering import Rendering, render
-from kibs_steps.simulate.site import ROOF, City, pick
 from kibs_steps.terrain import Terrain, flat
 
 # Azimuth, elevation and half angle (deg) of views that random scenes never show: models are judged there.

@@ -14,7 +14,7 @@ from kibs_steps import zbuffer
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction
 from kibs_steps.simulate import light
-from kibs_steps.simulate.site import City
+from kibs_steps.simulate.pieces import City
 from kibs_steps.simulate.truth import SectionTruth
 
 STRIP = 256  # rows shaded at a time

@@ -10,8 +10,9 @@ import numpy as np
 from kibs_steps.simulate import roofs
 from kibs_steps.simulate.houses import house
 from kibs_steps.simulate.outdoors import parking
+from kibs_steps.simulate.pieces import Place, pick
 from kibs_steps.simulate.roofs import Wing, wing
-from kibs_steps.simulate.site import Place, Site, pick
+from kibs_steps.simulate.site import Site
 
 
 def _tall(

@@ -12,7 +12,7 @@ import numpy as np
 from kibs_steps import view as geometry
 from kibs_steps import zbuffer
 from kibs_steps.grid import Grid
-from kibs_steps.simulate.site import ROOF, City
+from kibs_steps.simulate.pieces import ROOF, City
 from kibs_steps.terrain import Terrain
 
 

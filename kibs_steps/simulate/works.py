@@ -9,8 +9,9 @@ import numpy as np
 from kibs_steps.simulate import roofs
 from kibs_steps.simulate.dwellings import village
 from kibs_steps.simulate.outdoors import parking
+from kibs_steps.simulate.pieces import CLUTTER, ROOF, Face, pick
 from kibs_steps.simulate.roofs import wing
-from kibs_steps.simulate.site import CLUTTER, ROOF, Face, Site, pick
+from kibs_steps.simulate.site import Site
 
 
 def industry(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:

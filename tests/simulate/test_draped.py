@@ -11,8 +11,9 @@ from kibs_steps.grid import Grid
 from kibs_steps.learn.dataset import GRAPH_GSD, REDUCED, NoTrainingData, RoofGraph, read_roof_graphs
 from kibs_steps.simulate import draped, scene
 from kibs_steps.simulate.camera import Camera
+from kibs_steps.simulate.pieces import ROOF, City, Paint, Place
 from kibs_steps.simulate.rendering import render
-from kibs_steps.simulate.site import ROOF, City, Paint, Place, Site
+from kibs_steps.simulate.site import Site
 from kibs_steps.simulate.surfaces import palette
 from kibs_steps.zbuffer import planes
 

@@ -8,7 +8,7 @@ from kibs_steps import terrain as dtm
 from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
 from kibs_steps.simulate import citymodel, real, scene
-from kibs_steps.simulate.site import ROOF, WALL
+from kibs_steps.simulate.pieces import ROOF, WALL
 
 HOUSES = [cities.gable(x, y, 5.0 + 0.01 * x, 8 + i % 3, 7, 3 + i % 2, 6) for i, (x, y) in enumerate(
     (x, y) for x in range(0, 90, 18) for y in range(0, 90, 15)

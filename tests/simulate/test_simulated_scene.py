@@ -9,8 +9,8 @@ from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
 from kibs_steps.simulate import scene
 from kibs_steps.simulate.camera import Camera
+from kibs_steps.simulate.pieces import CLUTTER, OBJECT, ROOF, WALL, City, Face, Paint
 from kibs_steps.simulate.roofs import prism
-from kibs_steps.simulate.site import CLUTTER, OBJECT, ROOF, WALL, City, Face, Paint
 from kibs_steps.simulate.surfaces import Material
 
 GRID = Grid("", 0.0, 60.0, 0.3, 200, 200)
