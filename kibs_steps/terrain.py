@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 
 class Terrain(NamedTuple):
@@ -24,9 +23,15 @@ class Terrain(NamedTuple):
     def __call__(self, x_y: np.ndarray) -> np.ndarray:
         """Heights (n,) in m at map positions (n, 2)."""
         x_y = np.asarray(x_y, float)
-        col = (x_y[..., 0] - self.x0) / self.step[0]
-        row = (self.y0 - x_y[..., 1]) / self.step[1]
-        return map_coordinates(self.heights, [row, col], order=1, mode="nearest", output=np.float64)
+        rows, cols = self.heights.shape
+        col = np.clip((x_y[..., 0] - self.x0) / self.step[0], 0.0, cols - 1.0)
+        row = np.clip((self.y0 - x_y[..., 1]) / self.step[1], 0.0, rows - 1.0)
+        left, top = np.nan_to_num(col).astype(np.int64), np.nan_to_num(row).astype(np.int64)
+        right, below = np.minimum(left + 1, cols - 1), np.minimum(top + 1, rows - 1)
+        along, down = col - left, row - top
+        above = self.heights[top, left] * (1 - along) + self.heights[top, right] * along
+        under = self.heights[below, left] * (1 - along) + self.heights[below, right] * along
+        return above * (1 - down) + under * down
 
 
 def flat(height: float) -> Terrain:
