@@ -33,7 +33,7 @@ def contract(task: str, /, **changes: object) -> dict:
         "tile": TILE,
         "margin": MARGIN,
         "input": {"channels": "RGB", "scale": 1.0, "mean": [0.0, 0.0, 0.0], "std": [1.0, 1.0, 1.0]},
-        "thresholds": {"roof": 0.5, "marker": 0.5, "min_area": 6, "corner": 0.5, "corner_radius": 3.0},
+        "thresholds": {"roof": 0.5, "prominence": 0.2, "min_area": 6, "corner": 0.5, "corner_radius": 3.0},
         "trained_on": {"data": ["toy"], "licence": "CC0-1.0", "view_elevation": [50, 90]},
     }
     if task == "corners":
