@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps import fingerprint
+from kibs_steps import fingerprint, sources, tiled
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Block, Tiling
 from kibs_steps.models import contract
@@ -55,12 +55,21 @@ class Plan(NamedTuple):
 
     @property
     def terrain_files(self) -> list[str]:
-        """The terrain file, or nothing where the terrain is a number."""
+        """The terrain file, or nothing where the terrain is a number or remote."""
         try:
             float(self.dtm)
         except ValueError:
-            return [self.dtm]
+            return sources.files(self.dtm)
         return []
+
+    @property
+    def remote(self) -> list[str]:
+        """Raster and terrain that are read by URL."""
+        return [path for path in (self.raster, self.dtm) if sources.is_remote(path)]
+
+    def blocks_read(self, copy: str) -> str:
+        """The raster that blocks read: `copy` (a path) where the raster's own layout is too slow."""
+        return copy if self.settings.get("simulate") is None and tiled.needed(self.raster) else self.raster
 
     @property
     def reach(self) -> float:
@@ -131,9 +140,9 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
             raise BadConfig(
                 f"scene {name}: which terrain? Give dtm=FILE, or dtm=NUMBER for flat ground at that height (m)"
             )
-        dtm = str(dtm)
+        raster, dtm = sources.place(raster), sources.place(str(dtm))
         width, height = grid_size(raster, terms["gsd"], settings.get("aoi"))
-        source = [fingerprint.of_file(f, cache) if Path(f).is_file() else f for f in (raster, dtm)]
+        source = [sources.content(f, cache) for f in (raster, dtm)]
         truth_source = fingerprint.of_file(truth, cache) if truth and Path(truth).is_file() else truth
     if settings["feed"] == "truth" and not truth:
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")

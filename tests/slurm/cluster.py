@@ -153,7 +153,9 @@ class Cluster:
         deadline = time.monotonic() + 60
         states: list[str] = []
         while time.monotonic() < deadline:
-            done = subprocess.run(["sinfo", "-h", "-N", "-o", "%T"], env=self.environment, capture_output=True, text=True)
+            done = subprocess.run(
+                ["sinfo", "-h", "-N", "-o", "%T"], env=self.environment, capture_output=True, text=True
+            )
             states = done.stdout.split()
             if states == ["idle"] * self.nodes:
                 return
