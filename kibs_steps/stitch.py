@@ -26,7 +26,7 @@ import shapely
 from kibs_steps import cli, scene, store
 from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Block, Grid, Tiling
-from kibs_steps.sections import links_across
+from kibs_steps.sections import SEAM_RULES, links_across
 
 SAME_CORNER = 3.0  # px: two tiles' views of one corner lie closer than two corners of a roof
 NEAR = 4.0  # px: sections closer than this are smoothed together; smoothing moves no outline as far
@@ -113,7 +113,7 @@ def confirmed(core_area: np.ndarray, full_area: np.ndarray, links: np.ndarray) -
     return (core_area > 0) & (linked | (2 * core_area >= full_area))
 
 
-def joined(blocks: list[Block], found: Detections) -> Joined:
+def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
     """Which pieces of all blocks are one section. Reads numbers and seams only, seams of two rows of blocks at a time."""
     tables = {b.name: found.pieces(b, NUMBERS) for b in blocks}
     column = {name: np.concatenate([t[name].to_numpy() for t in tables.values()]) for name in NUMBERS}
@@ -144,7 +144,7 @@ def joined(blocks: list[Block], found: Detections) -> Joined:
         ):
             if place in at and seams[other_side].size:
                 neighbour, theirs = at[place]
-                pairs = links_across(theirs[side], seams[other_side])
+                pairs = links_across(theirs[side], seams[other_side], side, rule)
                 links.append(np.stack([numbered(neighbour, pairs[:, 0]), numbered(block, pairs[:, 1])], axis=1))
         at.pop((block.row - 1, block.col), None)
         at[block.row, block.col] = block, seams
@@ -279,10 +279,10 @@ def finished(sections: Parts, grid: Grid, tolerance: float) -> pa.Table:
 
 
 def sweep(
-    blocks: list[Block], found: Detections, grid: Grid, tiling: Tiling, tolerance: float
+    blocks: list[Block], found: Detections, grid: Grid, tiling: Tiling, tolerance: float, rule: str
 ) -> Iterator[tuple[int, pa.Table]]:
     """The sections of each row of blocks (table after `SECTIONS`, by id), row after row."""
-    whole = joined(blocks, found)
+    whole = joined(blocks, found, rule)
     last = whole.last_row()
     rows = sorted({b.row for b in blocks})
     side = tiling.stride * tiling.block
@@ -300,7 +300,13 @@ def sweep(
         every = Parts.joined(pieces)
         every = every.take(np.argsort(every.number))
         ready = last[every.group] <= row
-        open_, waiting = Parts.joined([open_, united(every.take(ready))]), every.take(~ready)
+        complete, waiting = every.take(ready), every.take(~ready)
+        if rule == "touch":
+            from kibs_steps import scan_order
+
+            split = scan_order.first_come(complete.geometry, complete.group, complete.split)
+            complete = complete._replace(split=split)
+        open_ = Parts.joined([open_, united(complete)])
         limit = (row + 1) * side
         leaves = np.ones(len(open_.group), bool)
         if tolerance > 0 and row != rows[-1]:
@@ -322,15 +328,21 @@ def sweep(
 
 
 def stitch(
-    blocks: list[Block], found: Detections, grid: Grid, tiling: Tiling, tolerance: float, reach: float
+    blocks: list[Block],
+    found: Detections,
+    grid: Grid,
+    tiling: Tiling,
+    tolerance: float,
+    reach: float,
+    rule: str = "overlap",
 ) -> Iterator[tuple[Block, pa.Table, pa.Table]]:
     """Every block, row by row, with its sections and corners (tables after `SECTIONS` and `corners.CORNERS`).
 
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
-    corners may lie.
+    corners may lie; `rule` as in `sections.links_across`: by `touch` the first piece in scan order also gives the split.
     """
     corners = distinct_corners(pa.concat_tables([CORNERS.empty_table(), *(found.corners(b) for b in blocks)]))
-    for row, table in sweep(blocks, found, grid, tiling, tolerance):
+    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule):
         of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 1]
         for block in sorted((b for b in blocks if b.row == row), key=lambda b: b.col):
             mine = table.filter(pa.array(of == block.col))
@@ -354,6 +366,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
     parser.add_argument("--tolerance", type=float, required=True, help="smoothing of pixel outlines, px; 0 for none")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
+    parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
     parser.add_argument("--corners", required=True, help="out: corners of all blocks")
@@ -369,7 +382,7 @@ def main(argv: list[str] | None = None) -> None:
     )
     blocks = [tiling.block_of(name) for name in folders]
     with store.by_block(args.sections, SECTIONS) as sections, store.by_block(args.corners, CORNERS) as corners:
-        for block, mine, near in stitch(blocks, found, facts.grid, tiling, args.tolerance, args.reach):
+        for block, mine, near in stitch(blocks, found, facts.grid, tiling, args.tolerance, args.reach, args.seam_rule):
             sections(block.name, mine)
             corners(block.name, near)
 

@@ -1,6 +1,7 @@
 # What all rules share: the plan of every scene, and functions from wildcards to parameters and inputs.
 
 import json
+import re
 from pathlib import Path
 
 import yaml
@@ -129,9 +130,16 @@ def licensed(wildcards):
     return [f"results/{wildcards.scene}/models/{task}.json" for task in tasks]
 
 
+def using(method):
+    """A wildcard constraint: the names of the scenes made by a method, or nothing at all."""
+    names = [re.escape(p.name) for p in PLANS.values() if p.settings["method"] == method]
+    return "|".join(names) or "(?!)"
+
+
 def published(p):
     """All published files of a scene."""
     names = PUBLISHED + (["evaluation.json"] if p.truth else [])
+    names += ["paper.tif"] if p.settings["mode"] == "paper" else []
     return [f"results/{p.name}/{f}" for f in names]
 
 
