@@ -29,6 +29,8 @@ DEFAULTS = {
     "truth_frame": "map",
     "truth_z": "absolute",
     "allow_angles": False,
+    "provider": "cpu",
+    "threads": 1,
     "lod_label": "2.0",
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
@@ -242,9 +244,10 @@ def signatures(
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
-    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"])
+    inference = some("provider", "threads")  # sums in another order differ in their last bits
+    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"], inference)
     s["blend"] = h(s["sections"], models["corners"].sha256)
-    s["corners"] = h(s["blend"], seen["corners"])
+    s["corners"] = h(s["blend"], seen["corners"], inference)
     s["single"] = h(s["sections"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.

@@ -111,6 +111,7 @@ rule model:
         "results/{scene}/models/{task}.json",
     log:
         "results/{scene}/logs/model_{task}.log",
+    localrule: True
     conda:
         RUN
     params:
