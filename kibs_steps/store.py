@@ -109,6 +109,43 @@ def read_table(path: str | Path, columns: list[str] | None = None, block: str | 
         raise DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error
 
 
+def merged(paths: list[str] | list[Path], order: list[str], columns: list[str] | None = None) -> Iterator[pa.Table]:
+    """The rows of many tables in ascending `order`, some at a time; at least one table, which may be empty.
+
+    Row groups are read in order of their smallest first key, and rows leave once no later group can come before them: when
+    ids run along the raster, as sections' do, about a row of blocks is in memory. Raises `DamagedFile`.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    import pyarrow.parquet as pq
+
+    groups = []
+    for path in paths:
+        try:
+            facts = pq.read_metadata(path)
+        except (pa.ArrowInvalid, OSError) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error
+        key = facts.schema.to_arrow_schema().names.index(order[0])
+        some = ((facts.row_group(i), i) for i in range(facts.num_row_groups))
+        groups += [(g.column(key).statistics.min, str(path), i) for g, i in some if g.num_rows]
+    groups.sort()
+    by = [(name, "ascending") for name in order]
+    held = read_table(paths[0], columns).slice(0, 0)
+    if not groups:
+        yield held
+    for k, (_, path, i) in enumerate(groups):
+        held = pa.concat_tables([held, pq.ParquetFile(path).read_row_group(i, columns)], promote_options="permissive")
+        if k + 1 < len(groups):
+            leaves = pc.less(held[order[0]], groups[k + 1][0])
+            ready, held = held.filter(leaves), held.filter(pc.invert(leaves))
+        else:
+            ready = held
+        if len(ready):
+            yield ready.sort_by(by)
+
+
 def write_arrays(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
     """Write named arrays as a compressed npz."""
     with whole(path) as temporary, temporary.open("wb") as target:

@@ -39,8 +39,13 @@ def flat(height: float) -> Terrain:
     return Terrain(np.full((1, 1), height, np.float64), 0.0, 0.0, (1.0, 1.0))
 
 
-def read(path: str | Path, bounds: tuple[float, float, float, float], margin: float = 200.0) -> Terrain:
-    """The part of a scene's `dtm.tif` within `margin` metres of `bounds` (left, bottom, right, top)."""
+def read(
+    path: str | Path, bounds: tuple[float, float, float, float], margin: float = 200.0, step: float = 0.0
+) -> Terrain:
+    """The part of a scene's `dtm.tif` within `margin` metres of `bounds` (left, bottom, right, top).
+
+    With a `step` (m) only every so many pixels are read, as far apart as that or a little less.
+    """
     import rasterio
     from rasterio.windows import Window
 
@@ -52,5 +57,8 @@ def read(path: str | Path, bounds: tuple[float, float, float, float], margin: fl
         r0, r1 = max(int(top) - 1, 0), min(int(bottom) + 2, source.height)
         c0, r0 = min(c0, source.width - 1), min(r0, source.height - 1)
         window = Window(c0, r0, max(c1 - c0, 1), max(r1 - r0, 1))
-        heights = source.read(1, window=window).astype(np.float64)
-    return Terrain(heights, t.c + (c0 + 0.5) * t.a, t.f + (r0 + 0.5) * t.e, (t.a, -t.e))
+        every = max(1, int(step // t.a))
+        shape = (-(-window.height // every), -(-window.width // every))
+        heights = source.read(1, window=window, out_shape=shape).astype(np.float64)
+    width, height = t.a * window.width / shape[1], -t.e * window.height / shape[0]
+    return Terrain(heights, t.c + c0 * t.a + width / 2, t.f + r0 * t.e - height / 2, (width, height))
