@@ -28,7 +28,7 @@ SAME_BYTES = [
     "labels.tif",
     "preview.png",
 ]
-SIZE = (280, 110)
+SIZE = (280, 90)
 
 LACKING = cluster.lacking()
 if not importlib.util.find_spec("snakemake_executor_plugin_slurm"):
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.skipif(bool(LACKING), reason=f"not installed here: {', 
 
 
 def world(folder: Path) -> Path:
-    """A folder with a painted raster of six blocks and toy models."""
+    """A folder with a painted raster of three blocks and toy models."""
     folder.mkdir()
     toy.raster(folder / "town.tif", toy.paint(toy.houses(np.random.default_rng(5), *SIZE), *SIZE))
     toy.models(folder / "models")
@@ -73,9 +73,6 @@ def watched_python(slurm: cluster.Cluster, fails_once: str) -> Path:
 
 
 def test_killed_run_with_a_failing_job_gives_the_bytes_of_a_local_run(tmp_path):
-    local = world(tmp_path / "local")
-    done = subprocess.run(command("--cores", "1"), cwd=local, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
     folder = world(tmp_path / "remote")
     with cluster.Cluster(tmp_path / "slurm", nodes=3, cpus=2) as slurm:
         notes = watched_python(slurm, "*kibs_steps.solids*r000c001*")
@@ -102,4 +99,7 @@ def test_killed_run_with_a_failing_job_gives_the_bytes_of_a_local_run(tmp_path):
     assert re.search(r"restart", again.stdout + again.stderr)
     nodes = {line.split()[0] for line in steps if "kibs_steps.sections" in line}
     assert nodes == {"n1", "n2", "n3"}
+    local = world(tmp_path / "local")
+    done = subprocess.run(command("--cores", "1"), cwd=local, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
     assert digests(folder) == digests(local)
