@@ -10,6 +10,7 @@ because its time would mean nothing.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import platform
@@ -38,6 +39,7 @@ SIZES = {
     "804": (30564, 26320),
 }  # Mpx: px; the last two the paper's
 FLOOD_SIDES = [400, 800, 1600]
+UNEQUAL = ("run.json", ".fingerprints.json")  # what two runs may differ in
 
 
 def snakemake(scene: str, folder: Path, models: str, cores: int, *flags: str) -> list[str]:
@@ -66,15 +68,17 @@ def planning(scene: str, folder: Path, work: Path, models: str) -> dict[str, flo
 
 def workflow(size: str, folder: Path, out: Path, models: str, cores: int, nice: int) -> dict[str, Any]:
     """Run the whole workflow on a raster from nothing; raises if it fails."""
-    work = out / f"work{size}"
+    work = out / (f"work{size}" if cores > 1 else f"work{size}on1")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     scene = f"city{size}"
     plan = planning(scene, folder, work, models)
     shutil.rmtree(work / ".snakemake", ignore_errors=True)
-    found = watch.watched(snakemake(scene, folder, models, cores, "--quiet", "all"), work, out / f"run{size}.log", nice)
+    found = watch.watched(
+        snakemake(scene, folder, models, cores, "--quiet", "all"), work, work.with_suffix(".log"), nice
+    )
     if found["code"]:
-        raise SystemExit(f"the workflow failed: see {out / f'run{size}.log'}")
+        raise SystemExit(f"the workflow failed: see {work.with_suffix('.log')}")
     results = work / "results" / scene
     counts = [pq.read_table(f, columns=["building_id"]) for f in sorted(results.glob("blocks/*/solids.parquet"))]
     with rasterio.open(folder / "raster.tif") as source:
@@ -86,7 +90,14 @@ def workflow(size: str, folder: Path, out: Path, models: str, cores: int, nice: 
         "raster_bytes": raw,
         "buildings": sum(map(len, counts)),
         "published": watch.used(results) - watch.used(results / "blocks"),
+        "sha256": {f.name: digest(f) for f in sorted(results.iterdir()) if f.is_file() and f.name not in UNEQUAL},
     }
+
+
+def digest(path: Path) -> str:
+    """sha256 of a file."""
+    with path.open("rb") as source:
+        return hashlib.file_digest(source, "sha256").hexdigest()
 
 
 def model_files(models: str) -> list[Path]:
@@ -161,6 +172,20 @@ def table(known: dict[str, Any], cores: int) -> str:
         for name, step in run["steps"].items():
             share = step["cpu"] / total
             lines.append(f"| {name} | {step['jobs']:.0f} | {step['cpu']:.1f} | {share:.1%} | {step['peak_mb']:.0f} |")
+    single, alone = (
+        values.get("floor on 1 core"),
+        [key for key in values if key.endswith("on 1 core") and "workflow" in key],
+    )
+    for key in alone:
+        one, many = values[key], values.get(key.removesuffix(" on 1 core"))
+        if not many or not single or not floor:
+            continue
+        ours, bare = one["wall"] / many["wall"], single["per_tile"] / floor["per_tile"]
+        lines += [
+            "",
+            f"{one['mpx']} Mpx, {floor['cores']} cores against one: {ours:.2f} × faster, the bare model loop {bare:.2f} ×, ratio "
+            f"{ours / bare:.2f}; published files the same bytes: {'yes' if one['sha256'] == many['sha256'] else 'NO'}.",
+        ]
     lines += ["", "The paper's way, same cores:", ""]
     if pair and floor and "per_tile" in pair:
         lines.append(
@@ -190,6 +215,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for rasters, runs and results")
     parser.add_argument("--sizes", nargs="+", choices=list(SIZES), default=["1", "10"], help="Mpx")
     parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--one-core", nargs="*", choices=list(SIZES), default=[], help="Mpx to run on one core too")
     parser.add_argument("--models", default="research", help="a model set, as the workflow's key")
     parser.add_argument("--library", type=int, default=24, help="simulated scenes that the rasters are made of")
     parser.add_argument("--floor-tiles", type=int, default=64, help="tiles per core that the floor is measured on")
@@ -223,9 +249,11 @@ def main() -> None:
             key,
             lambda n=cores: {"per_tile": rivals.per_tile(files, args.floor_tiles, n), "stride": stride, "cores": n},
         )
-    for size in args.sizes:
-        run = (size, out / f"raster{size}", out, args.models, args.cores, args.nice)
-        measured(out, f"workflow {size}", lambda r=run: workflow(*r))
+    runs = [(size, args.cores, f"workflow {size}") for size in args.sizes]
+    runs += [(size, 1, f"workflow {size} on 1 core") for size in args.one_core]
+    for size, cores, key in runs:
+        run = (size, out / f"raster{size}", out, args.models, cores, args.nice)
+        measured(out, key, lambda r=run: workflow(*r))
     if args.pair_tiles:
         measured(out, "pair", lambda: paper_models(out, args.pair_tiles, args.cores))
     largest = next(size for size in reversed(SIZES) if (out / f"work{size}").is_dir())
