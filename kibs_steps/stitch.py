@@ -322,9 +322,11 @@ def sweep(
         table = pa.concat_tables(done).sort_by("section_id")
         of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 0]
         while unwritten < len(rows) and rows[unwritten] <= row and (rows[unwritten] + 1) * side <= top:
-            yield rows[unwritten], table.filter(pa.array(of == rows[unwritten]))
+            leaving = of <= rows[unwritten]
+            yield rows[unwritten], table.filter(pa.array(leaving))
+            table, of = table.filter(pa.array(~leaving)), of[~leaving]
             unwritten += 1
-        done = [table.filter(pa.array(of >= (rows[unwritten] if unwritten < len(rows) else np.inf)))]
+        done = [table]
 
 
 def stitch(
