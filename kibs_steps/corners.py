@@ -69,9 +69,11 @@ def main(argv: list[str] | None = None) -> None:
     facts = scene.read(args.scene)
     model = runtime.from_record(args.model, "corners")
     tiling = Tiling(model.contract["tile"], args.margin, args.block)
-    tiles = tiling.tiles(tiling.block_of(args.name), facts.grid.width, facts.grid.height)
+    block = tiling.block_of(args.name)
+    tiles = tiling.tiles(block, facts.grid.width, facts.grid.height)
     images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
-    geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
+    seen = facts.view_of(tiling.block_core(block, facts.grid.width, facts.grid.height))
+    geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry, args.provider, args.threads)
     tables = [CORNERS.empty_table()]
     for tile in tiles:

@@ -32,6 +32,7 @@ DEFAULTS = {
     "provider": "cpu",
     "threads": 1,
     "lod_label": "2.0",
+    "drape": False,
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
 TASKS = {"two_stage": ("sections", "corners"), "single": ("both",)}
@@ -118,6 +119,7 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
+    settings = {**angles_of(settings), **settings}
     if settings["mode"] == "paper":
         settings = {**settings, **PAPER_MODE}
     models = models_for(settings, base)
@@ -165,6 +167,15 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     signature = signatures(settings, source, truth_source, models, tiling, cache)
     warnings = [] if settings["feed"] == "truth" else angle_warnings(settings, models)
     return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings)
+
+
+def angles_of(settings: dict[str, Any]) -> dict[str, float]:
+    """The angles that the scene's `metadata` tells, by their keys; what is set itself comes before them."""
+    if not settings.get("metadata"):
+        return {}
+    from kibs_steps import metadata
+
+    return {key: value for key, value in metadata.read(settings["metadata"])._asdict().items() if value is not None}
 
 
 def direction(settings: dict[str, Any], name: str) -> dict[str, float] | None:
@@ -230,7 +241,7 @@ def signatures(
         value = settings.get(key)
         return fingerprint.of_file(value, cache) if value and Path(value).is_file() else value
 
-    angles = some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation")
+    angles = [some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"), content("regions")]
     seen = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
     s = {"source": h(version("kibs-steps"), source)}
     s["scene"] = h(
@@ -251,11 +262,20 @@ def signatures(
     s["single"] = h(s["sections"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.
-    detected = s["single" if settings["method"] == "single" else "corners"]
+    detected = s["single" if settings["method"] == "single" else "sections" if settings.get("dsm") else "corners"]
     s["stitch"] = h(s["feed"] if settings["feed"] == "truth" else detected, models["corners"].sha256, settings["mode"])
-    s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
+    s["edited"] = h(s["stitch"], s["scene"], content("sections")) if settings.get("sections") else s["stitch"]
+    s["surface"] = h(s["scene"], content("dsm"))
+    s["planes"] = h(
+        s["edited"],
+        s["scene"],
+        models["corners"].sha256,
+        settings["planes"],
+        s["surface"] if settings.get("dsm") else None,
+    )
     s["buildings"] = h(s["planes"], content("footprints"))
     s["solids"] = h(s["buildings"], settings["lod_label"])
     s["evaluate"] = h(s["planes"], s["truth"])
+    s["glb"] = h(s["solids"], settings["drape"])
     s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
     return s

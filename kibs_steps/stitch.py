@@ -370,6 +370,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
+    parser.add_argument("--without-corners", action="store_true", help="no corners were looked for")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
     parser.add_argument("--corners", required=True, help="out: corners of all blocks")
     args = parser.parse_args(argv)
@@ -380,7 +381,9 @@ def main(argv: list[str] | None = None) -> None:
         pieces=lambda b, columns: store.read_table(folders[b.name] / "pieces.parquet", columns),
         links=lambda b: store.read_table(folders[b.name] / "links.parquet"),
         seams=lambda b: store.read_arrays(folders[b.name] / "seams.npz"),
-        corners=lambda b: store.read_table(folders[b.name] / "corners.parquet"),
+        corners=lambda b: (
+            CORNERS.empty_table() if args.without_corners else store.read_table(folders[b.name] / "corners.parquet")
+        ),
     )
     blocks = [tiling.block_of(name) for name in folders]
     with store.by_block(args.sections, SECTIONS) as sections, store.by_block(args.corners, CORNERS) as corners:

@@ -124,3 +124,21 @@ def test_fingerprint_survives_a_damaged_cache(tmp_path):
     first = fingerprint.of_file(file, cache)
     cache.write_text("{")
     assert fingerprint.of_file(file, cache) == first
+
+
+def test_a_simulated_city_reruns_with_its_file(files):
+    folder, _ = files
+    city = folder / "c.city.json"
+    scene = {"simulate": {"seed": 1, "size": 200, "city": str(city)}, "models": str(folder / "a")}
+    scene = {**scene, **toy.VIEW, "sun_azimuth": 155, "sun_elevation": 45}
+
+    def sources():
+        ((name, full),) = plan.scenes({"scenes": {"d": scene}}, SCHEMA).items()
+        return plan.plan(name, full, folder, folder / "results").signature["source"]
+
+    with pytest.raises(BadConfig, match="is not there"):
+        sources()
+    city.write_text("{}")
+    first = sources()
+    city.write_text("{ }")
+    assert sources() != first

@@ -185,7 +185,7 @@ def pasted(box: np.ndarray, mask: np.ndarray, size: int) -> tuple[tuple[slice, s
     col = (np.arange(x0, x1) + 0.5 - box[0]) / max(box[2] - box[0], 1e-3) * n - 0.5
     row = (np.arange(y0, y1) + 0.5 - box[1]) / max(box[3] - box[1], 1e-3) * n - 0.5
     grid = np.meshgrid(row, col, indexing="ij")
-    return (slice(y0, y1), slice(x0, x1)), ndimage.map_coordinates(mask, grid, order=1, mode="constant")
+    return (slice(y0, y1), slice(x0, x1)), ndimage.map_coordinates(mask, grid, order=1, mode="grid-constant")
 
 
 def height_moments(distribution: np.ndarray, heights: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -44,6 +44,8 @@ SECTION_COLUMNS = (
     "score",
     "area",
     "split",
+    "sigma_along",
+    "sigma_across",
 )
 BUILDING_COLUMNS = (
     "building_id",
@@ -59,6 +61,9 @@ BUILDING_COLUMNS = (
     "volume",
     "footprint_area",
     "roof_type",
+    "height_sigma",
+    "position_sigma",
+    "faithful",
 )
 FOOTPRINT_COLUMNS = ("building_id", "lod", "ground_z", "height", "footprint_area")
 CORNER_COLUMNS = ("section_id", "height", "sigma", "score")

@@ -41,6 +41,7 @@ LIBRARIES = (
     "opencv-python-headless",
     "scikit-image",
     "pillow",
+    "trimesh",
 )
 MOST = 20  # reasons listed
 

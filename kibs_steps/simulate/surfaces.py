@@ -307,6 +307,7 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
         list(rng.gamma(0.6, 1, 4) + 0.05),
     )
     add("gravel", [Material(_jitter(rng, c, 0.15), 0.2, 0.08) for c in ((0.42, 0.40, 0.36), (0.36, 0.31, 0.25))])
+    add("photograph", [Material((1.0, 1.0, 1.0), 0.0, 0.02)])
     add("marking", [Material((0.6, 0.6, 0.58), 0.2, 0.08)])
     add(
         "water",

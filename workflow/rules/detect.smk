@@ -223,8 +223,9 @@ rule stitch:
         folders=lambda w: [
             f"results/{w.scene}/blocks/{b.name}/{source(w)}" for b in plan(w).blocks
         ],
+        corners=lambda w: ["--without-corners"] if measured(plan(w)) else [],
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"
-        " --reach {params.reach} --seam-rule {params.seams}"
+        " --reach {params.reach} --seam-rule {params.seams} {params.corners}"
         " --folders {params.folders:q} --sections {output.sections:q} --corners {output.corners:q} > {log:q} 2>&1"

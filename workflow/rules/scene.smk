@@ -54,6 +54,7 @@ rule scene:
             "bands",
             "aoi",
             "vertical_crs",
+            "regions",
         ),
     shell:
         "python -m kibs_steps.scene --name {wildcards.scene:q} --raster {params.raster:q} --dtm={params.dtm:q}"
