@@ -34,7 +34,7 @@ SLACK = 0.5  # m, the same where a step explains the gap
 STEP = 3.0  # m, higher steps divide buildings
 FACING = -0.7  # cosine between the directions of two outlines that face each other
 OVERLAP = 0.25  # m², sections over each other by as much are together
-AT_ONCE = 2_000_000  # edge pairs held in memory
+AT_ONCE = 250_000  # edge pairs held in memory
 
 
 class FootprintsUnusable(KibsError):

@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps import fingerprint
+from kibs_steps import fingerprint, sources, tiled
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Block, Tiling
 from kibs_steps.models import contract, suite
@@ -29,6 +29,8 @@ DEFAULTS = {
     "truth_frame": "map",
     "truth_z": "absolute",
     "allow_angles": False,
+    "provider": "cpu",
+    "threads": 1,
     "lod_label": "2.0",
     "drape": False,
 }
@@ -59,12 +61,21 @@ class Plan(NamedTuple):
 
     @property
     def terrain_files(self) -> list[str]:
-        """The terrain file, or nothing where the terrain is a number."""
+        """The terrain file, or nothing where the terrain is a number or remote."""
         try:
             float(self.dtm)
         except ValueError:
-            return [self.dtm]
+            return sources.files(self.dtm)
         return []
+
+    @property
+    def remote(self) -> list[str]:
+        """Raster and terrain that are read by URL."""
+        return [path for path in (self.raster, self.dtm) if sources.is_remote(path)]
+
+    def blocks_read(self, copy: str) -> str:
+        """The raster that blocks read: `copy` (a path) where the raster's own layout is too slow."""
+        return copy if self.settings.get("simulate") is None and tiled.needed(self.raster) else self.raster
 
     @property
     def seam_rule(self) -> str:
@@ -146,9 +157,9 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
             raise BadConfig(
                 f"scene {name}: which terrain? Give dtm=FILE, or dtm=NUMBER for flat ground at that height (m)"
             )
-        dtm = str(dtm)
+        raster, dtm = sources.place(raster), sources.place(str(dtm))
         width, height = grid_size(raster, terms["gsd"], settings.get("aoi"))
-        source = [fingerprint.of_file(f, cache) if Path(f).is_file() else f for f in (raster, dtm)]
+        source = [sources.content(f, cache) for f in (raster, dtm)]
         truth_source = fingerprint.of_file(truth, cache) if truth and Path(truth).is_file() else truth
     if settings["feed"] == "truth" and not truth:
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
@@ -244,9 +255,10 @@ def signatures(
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
-    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"])
+    inference = some("provider", "threads")  # sums in another order differ in their last bits
+    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"], inference)
     s["blend"] = h(s["sections"], models["corners"].sha256)
-    s["corners"] = h(s["blend"], seen["corners"])
+    s["corners"] = h(s["blend"], seen["corners"], inference)
     s["single"] = h(s["sections"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.

@@ -9,6 +9,7 @@ from snakemake.exceptions import WorkflowError
 from snakemake.io import IOFile
 
 from kibs_steps import plan as plans
+from kibs_steps import sources
 from kibs_steps.errors import KibsError
 
 RESULTS = Path("results")
@@ -108,6 +109,11 @@ def blocks(path):
         f"results/{wildcards.scene}/blocks/{b.name}/{path}"
         for b in plan(wildcards).blocks
     ]
+
+
+def blocks_read(wildcards):
+    """The raster that blocks read: the scene's own, or its tiled copy."""
+    return plan(wildcards).blocks_read(f"results/{wildcards.scene}/tiled.tif")
 
 
 def source(wildcards):

@@ -40,7 +40,7 @@ rule surface:
     """Bring the user's surface model into the scene's CRS."""
     input:
         scene=given("results/{scene}/scene.json"),
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(plan(w).raster)),
         dsm=given(lambda w: plan(w).settings["dsm"]),
     output:
         "results/{scene}/surface.tif",
