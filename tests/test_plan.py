@@ -45,7 +45,7 @@ def changed(files, **settings):
     return {step for step in one if one[step] != other[step]}
 
 
-AFTER_DETECTION = {"stitch", "planes", "buildings", "solids", "evaluate", "run"}
+AFTER_DETECTION = {"stitch", "edited", "planes", "buildings", "solids", "glb", "evaluate", "run"}
 
 
 def test_blocks_cover_the_raster(files):
@@ -124,3 +124,27 @@ def test_fingerprint_survives_a_damaged_cache(tmp_path):
     first = fingerprint.of_file(file, cache)
     cache.write_text("{")
     assert fingerprint.of_file(file, cache) == first
+
+
+def test_a_simulated_city_reruns_with_its_file(files):
+    folder, _ = files
+    city = folder / "c.city.json"
+    scene = {"simulate": {"seed": 1, "size": 200, "city": str(city)}, "models": str(folder / "a")}
+    scene = {**scene, **toy.VIEW, "sun_azimuth": 155, "sun_elevation": 45}
+
+    def sources():
+        ((name, full),) = plan.scenes({"scenes": {"d": scene}}, SCHEMA).items()
+        return plan.plan(name, full, folder, folder / "results").signature["source"]
+
+    with pytest.raises(BadConfig, match="is not there"):
+        sources()
+    city.write_text("{}")
+    first = sources()
+    city.write_text("{ }")
+    assert sources() != first
+
+
+@pytest.mark.parametrize("settings", [{"provider": "openvino"}, {"threads": 2}])
+def test_other_hardware_reruns_the_models_and_nothing_before(files, settings):
+    """Sums in another order differ in their last bits: blocks of both are never mixed."""
+    assert changed(files, **settings) == {"sections", "blend", "corners", "single", *AFTER_DETECTION}

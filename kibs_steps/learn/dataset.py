@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
+from rasterio.features import rasterize
 
 from kibs_steps.errors import KibsError
 from kibs_steps.models import runtime
@@ -250,9 +251,10 @@ def pasted_houses(
         graph = graphs[rng.integers(len(graphs))]
         affine = _house_affine(graph, rng, size)
         vertices = graph.vertices @ affine[:, :2].T + affine[:, 2]
-        own = np.zeros((size, size), np.int32)
-        for i, face in enumerate(graph.faces, start=1):
-            cv2.fillPoly(own, [np.round((vertices[face] - 0.5) * 16).astype(np.int32)], i, shift=4)
+        # By pixel centres: OpenCV would draw rims too, and every face half a pixel too wide.
+        rings = (vertices[np.append(face, face[0])].tolist() for face in graph.faces)
+        faces = [({"type": "Polygon", "coordinates": [ring]}, i) for i, ring in enumerate(rings, start=1)]
+        own = rasterize(faces, (size, size), dtype=np.int32)
         house = (own > 0).astype(np.uint8)
         if not house.any() or (taken & cv2.dilate(house, np.ones((5, 5), np.uint8))).any():
             continue

@@ -35,7 +35,7 @@ def contract_of(
     """The contract of a network trained here.
 
     `heights` are mean and standard deviation (m) of the training set's corners; `facts` replace or add fields of the
-    contract: `thresholds` (merged), `metrics`, and `seed`, `commit`, `about` (what the run was trained on).
+    contract: `thresholds` (merged), `metrics`, `score`, and `seed`, `commit`, `about` (what the run was trained on).
     """
     contract: dict[str, Any] = {
         "contract": 1,
@@ -78,8 +78,7 @@ def contract_of(
             "fallback": round(mean, 2),
             "fallback_sigma": round(sigma, 2),
         }
-    if "metrics" in facts:
-        contract["metrics"] = facts["metrics"]
+    contract.update({k: facts[k] for k in ("metrics", "score") if k in facts})
     return contracts.validate(contract, "the new contract")
 
 
@@ -140,7 +139,13 @@ def main(argv: list[str] | None = None) -> None:
     if args.commit:
         facts["commit"] = args.commit
     if args.metrics:
-        facts["metrics"] = store.read_json(args.metrics)
+        report = store.read_json(args.metrics)
+        chosen = {k: v for k, v in report.pop("thresholds", {}).items() if k in THRESHOLDS[task]}
+        facts["thresholds"] = {**chosen, **args.thresholds}
+        if "score" in report and args.task != "corners":
+            facts["score"] = report["score"]
+        report.pop("score", None)
+        facts["metrics"] = report
     if heights is None and args.pool and task != "sections":
         heights = corner_height_moments(Path(args.pool))
     export(model, args.out, contract_of(task, heights, settings.family, **facts))
