@@ -11,9 +11,9 @@ from kibs_steps.simulate.dwellings import rows, suburb, village
 from kibs_steps.simulate.outdoors import park
 from kibs_steps.simulate.site import Site
 from kibs_steps.simulate.town import centre, desert, estate, perimeter
-from kibs_steps.simulate.works import farm, industry
+from kibs_steps.simulate.works import farm, harbour, industry
 
 FILL: dict[str, Callable[[Site, float, float, float, float], None]] = {
     "suburb": suburb, "rows": rows, "village": village, "perimeter": perimeter, "centre": centre,
-    "industry": industry, "farm": farm, "desert": desert, "park": park, "estate": estate,
+    "industry": industry, "farm": farm, "desert": desert, "park": park, "estate": estate, "harbour": harbour,
 }  # fmt: skip

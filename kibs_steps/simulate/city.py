@@ -19,7 +19,7 @@ from kibs_steps.simulate.site import Site
 from kibs_steps.simulate.surfaces import palette
 from kibs_steps.terrain import Terrain
 
-STYLES = ("suburb", "rows", "village", "perimeter", "centre", "industry", "farm", "desert", "estate")
+STYLES = ("suburb", "rows", "village", "perimeter", "centre", "industry", "farm", "desert", "estate", "harbour")
 BLOCKS = {  # block length and depth, road width: least and most (m)
     "suburb": (80, 170, 46, 78, 5, 9),
     "rows": (70, 150, 38, 80, 5, 10),
@@ -30,12 +30,13 @@ BLOCKS = {  # block length and depth, road width: least and most (m)
     "farm": (90, 220, 80, 200, 3, 5),
     "desert": (50, 110, 30, 60, 4, 10),
     "estate": (90, 200, 70, 130, 6, 12),
+    "harbour": (80, 200, 70, 150, 6, 12),
     "mixed": (60, 130, 50, 90, 5, 14),
     "town": (70, 150, 45, 85, 5, 10),
 }
 MIXTURES = {  # shares of the styles; a town is detached houses and rows, some old core, some works
-    "mixed": (0.2, 0.17, 0.12, 0.15, 0.1, 0.11, 0.04, 0.05, 0.06),
-    "town": (0.46, 0.26, 0.14, 0.0, 0.0, 0.1, 0.04, 0.0, 0.0),
+    "mixed": (0.2, 0.17, 0.12, 0.15, 0.1, 0.1, 0.04, 0.05, 0.06, 0.01),
+    "town": (0.46, 0.26, 0.14, 0.0, 0.0, 0.1, 0.04, 0.0, 0.0, 0.0),
 }
 DETACHED = ("suburb", "rows", "village", "farm")  # where photographed houses may stand
 NATIVE = {  # where a style is at home; elsewhere now and then

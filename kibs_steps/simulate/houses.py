@@ -100,6 +100,15 @@ def house(
         0.0 if flat else pick(rng, [0.0, rng.uniform(0.2, 0.9)]),
         pick(rng, [0.0, rng.uniform(0.2, 0.8)]) if flat else 0.0,
     )
+    if length > 6 and rng.random() < 0.15 * site.leafy:  # a tree that hides the eave
+        side = pick(rng, [-1.0, 1.0])
+        off = rng.uniform(0.8, 2.5)
+        along, across = (length / 2 + off, rng.uniform(-0.5, 0.5) * width)
+        if rng.random() < 0.6:
+            along, across = rng.uniform(-0.5, 0.5) * length, width / 2 + off
+        x, y = place.put(np.array([[side * along, side * across]]))[0].tolist()
+        tall = rng.uniform(4, 12)
+        site.tree(x, y, tall * rng.uniform(0.25, 0.4), tall)
 
 
 def church(site: Site, place: Place) -> None:

@@ -47,7 +47,23 @@ def add_decoys(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
 def park(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
     """No buildings: park, water, sport, wood, rails."""
     rng = site.rng
-    what = pick(rng, ["park", "wood", "water", "sport", "rails", "square"])
+    what = pick(
+        rng,
+        [
+            "park",
+            "park",
+            "wood",
+            "water",
+            "sport",
+            "pitch",
+            "rails",
+            "square",
+            "roundabout",
+            "orchard",
+            "lawn",
+            "parking",
+        ],
+    )
     site.paint_street(s0, t0, s1, t1, {"rails": "soil", "square": "pavement"}.get(what, "lawn"))
     cs, ct = (s0 + s1) / 2, (t0 + t1) / 2
     place = site.place(cs, ct)
@@ -72,6 +88,23 @@ def park(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
                 site.paint(p.put(np.array(roofs.rectangle(-7.5, -16, 7.5, 16))), "court")
                 site.paint(p.put(np.array(roofs.rectangle(-5.5, -12, 5.5, 12))), "court")
                 site.paint(p.put(np.array(roofs.rectangle(-5.5, -0.1, 5.5, 0.1))), "marking")
+    elif what == "pitch":
+        _pitch(site, s0, t0, s1, t1)
+    elif what == "roundabout":
+        _roundabout(site, s0, t0, s1, t1)
+    elif what == "orchard":
+        gap, tall = rng.uniform(3.5, 8.0), rng.uniform(2.5, 7.0)
+        for s in np.arange(s0 + 2, s1 - 2, gap):
+            for t in np.arange(t0 + 2, t1 - 2, gap * rng.uniform(0.6, 1.1)):
+                x, y = site.at(s, t)
+                site.tree(x, y, tall * 0.35, tall * rng.uniform(0.8, 1.2))
+    elif what == "lawn":
+        site.paint_street(s0, t0, s1, t1, pick(rng, ["lawn", "rough", "field", "soil"]), 0.2)
+    elif what == "parking":
+        parking(site, s0, t0, s1, t1)
+        for _ in range(int(rng.integers(1, 6))):  # planted islands
+            a, b = rng.uniform(s0, s1), rng.uniform(t0, t1)
+            site.paint_street(a, b, a + rng.uniform(3, 15), b + rng.uniform(1.5, 3), pick(rng, ["lawn", "pavement"]))
     elif what == "rails":
         for t in np.arange(t0 + 3, t1 - 3, rng.uniform(4, 6)):
             site.paint_street(s0 - 6, t - 1.3, s1 + 6, t + 1.3, "rail")
@@ -93,7 +126,68 @@ def park(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
             site.paint_street(a, t0, b + 3, t1, "rough", 0.2)
         p = np.cumsum(np.column_stack([np.full(12, 2 * w / 11), rng.normal(0, 4, 12)]), 0) - [w, 0]
         site.paint(place.put(np.concatenate([p, p[::-1] + np.array([0, 2.2])])), "gravel")
-    site.trees(s0, t0, s1, t1, {"wood": 3.0, "park": 1.2}.get(what, 0.25) * rng.uniform(0.4, 1.4), 11)
+    site.trees(
+        s0,
+        t0,
+        s1,
+        t1,
+        {"wood": 3.0, "park": 1.2, "pitch": 0.05, "lawn": 0.08, "orchard": 0.0}.get(what, 0.25) * rng.uniform(0.4, 1.4),
+        11,
+    )
+
+
+def _pitch(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
+    """A sports ground: mown stripes, white lines, perhaps a bright or red surface around."""
+    rng = site.rng
+    place = site.place((s0 + s1) / 2, (t0 + t1) / 2, pick(rng, [0.0, np.pi / 2]))
+    long, wide = rng.uniform(18, 50), rng.uniform(14, 32)
+    if rng.random() < 0.4:
+        site.paint(
+            place.put(np.array(roofs.rectangle(-long - 5, -wide - 5, long + 5, wide + 5))),
+            pick(rng, ["track", "gravel"]),
+        )
+    turf, stripes = pick(rng, ["lawn", "lawn", "court"]), int(rng.integers(4, 14))
+    material, mark = site.kit.draw(rng, turf), site.kit.uses["marking"][0]
+    edges = np.linspace(-long, long, stripes + 1)
+    deep = rng.uniform(0.0, 0.12)
+    for i in range(stripes):
+        site.paint(place.put(np.array(roofs.rectangle(edges[i], -wide, edges[i + 1], wide))), material, 0.02)
+        bright = 1 + (deep if i % 2 else -deep)
+        site.paints[-1] = site.paints[-1]._replace(tint=(bright, bright, bright))
+    thin = 0.12
+    for a, b, c, d in (
+        (-long, -wide, long, -wide + thin), (-long, wide - thin, long, wide), (-thin, -wide, thin, wide),
+        (-long, -wide, -long + thin, wide), (long - thin, -wide, long, wide),
+    ):  # fmt: skip
+        site.paint(place.put(np.array(roofs.rectangle(a, b, c, d))), mark, 0.05)
+
+
+def _roundabout(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
+    """A roundabout with its arms, cycle path and islands, on lawn."""
+    rng = site.rng
+    cs, ct = (s0 + s1) / 2, (t0 + t1) / 2
+    place = site.place(cs, ct)
+    angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    oval = np.column_stack([np.cos(angle), np.sin(angle)])
+    outer, width = rng.uniform(10, 18), rng.uniform(5.5, 8)
+    path = pick(rng, ["track", "pavement", "asphalt"])
+    arm = width / 2 + rng.uniform(0, 2)
+    site.paint(place.put((outer + rng.uniform(3, 6)) * oval), path, 0.1)
+    site.paint(place.put((outer + rng.uniform(0.5, 2)) * oval), pick(rng, ["lawn", "pavement"]), 0.1)
+    for wide, use in ((arm + 3, path), (arm, site.road)):
+        site.paint_street(s0 - 8, ct - wide, s1 + 8, ct + wide, use, 0.05)
+        site.paint_street(cs - wide, t0 - 8, cs + wide, t1 + 8, use, 0.05)
+    site.paint(place.put(outer * oval), site.road, 0.05)
+    site.paint(place.put((outer - width) * oval), "pavement", 0.1)
+    site.paint(place.put((outer - width - rng.uniform(0.5, 2)) * oval), pick(rng, ["lawn", "rough", "gravel"]), 0.1)
+    for turn in range(4):
+        island = site.place(cs, ct, turn * np.pi / 2)
+        site.paint(island.put(np.array([[outer, -0.3], [outer + 9, -0.2], [outer + 9, 0.2], [outer, 1.6]])), "pavement")
+    for _ in range(int(rng.integers(0, 8))):
+        a = rng.uniform(0, 2 * np.pi)
+        r = outer - width / 2
+        spot = site.place(cs + r * np.cos(a), ct + r * np.sin(a), a + np.pi / 2)
+        site.car(spot.x, spot.y, spot.angle)
 
 
 def street(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:

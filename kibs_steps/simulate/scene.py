@@ -82,8 +82,8 @@ def random_scene(
     rng: np.random.Generator,
     size: int = 256,
     gsd: float = 0.38,
-    view_elevation: tuple[float, float] = (50, 90),
-    sun_elevation: tuple[float, float] = (20, 70),
+    view_elevation: tuple[float, float] = (45, 90),
+    sun_elevation: tuple[float, float] = (15, 75),
     backgrounds: list[tuple[np.ndarray, np.ndarray]] | None = None,
     style: str | None = None,
     cities: Sequence[CityModel] = (),
@@ -104,15 +104,16 @@ def random_scene(
     seen_from = _direction(*(view or _random_view(rng, *view_elevation)))
     lit_from = _direction(*(sun or (rng.uniform(0, 360), rng.uniform(*sun_elevation))))
     style = style or str(
-        rng.choice([*STYLES, "mixed", "town"], p=[0.18, 0.13, 0.1, 0.11, 0.09, 0.08, 0.02, 0.05, 0.05, 0.11, 0.08])
+        rng.choice([*STYLES, "mixed", "town"], p=[0.17, 0.13, 0.1, 0.11, 0.09, 0.08, 0.02, 0.05, 0.05, 0.03, 0.1, 0.07])
     )
-    margin = 25.0 + (15.0 if style in ("centre", "perimeter") else 0.0)
+    model = pick(rng, cities) if len(cities) and rng.random() < city_share else None
+    # Tall buildings outside lean into the tile.
+    margin = 40.0 if model else {"centre": 55.0, "perimeter": 40.0, "estate": 40.0}.get(style, 25.0)
     terrain = flat(0.0)
     if rng.random() < 0.35:
         low, high = -margin - 60, side + margin + 60
         terrain = relief(rng, (low, low, high, high), 2.0, rng.uniform(0, 6), rng.uniform(0, 0.15))
     wide = side + 2 * margin
-    model = pick(rng, cities) if len(cities) and rng.random() < city_share else None
     stock = houses if len(houses) and not model and rng.random() < house_share else ()
     if len(stock):
         style = pick(rng, ("suburb", "suburb", "suburb", "village", "town", "farm"))

@@ -222,9 +222,27 @@ class Site:
         self.faces += [Face(place.put(r), (), kind, 0, 0, material, shade) for r in (top, *sides)]
 
     def tank(self, place: Place, radius: float, height: float) -> None:
-        """A round tank or silo: looks like a roof, is none."""
-        angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-        self.box(place, radius * np.column_stack([np.cos(angle), np.sin(angle)]), height, "metal")
+        """A round tank or silo, flat, conical or with a sunken floating roof: looks like a roof, is none."""
+        rng = self.rng
+        if self.built(place.x, place.y):
+            return
+        angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+        ring = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        place = self.grounded(place, ring)
+        material, shade = self.kit.draw(rng, "tank"), self.tint(0.1)
+        top, sides = roofs.prism(ring, 0.0, height)
+        kind = rng.random()
+        if kind < 0.45:
+            apex = np.array([0.0, 0.0, height + radius * rng.uniform(0.08, 0.3)])
+            lids = [np.array([a, b, apex]) for a, b in zip(top, np.roll(top, -1, axis=0), strict=True)]
+        elif kind < 0.75:
+            lids = [top - np.array([0.0, 0.0, min(0.6 * height, rng.uniform(0.5, 3.0))])]
+        else:
+            lids = [top]
+        self.faces += [Face(place.put(r), (), OBJECT, 0, 0, material, shade) for r in (*lids, *sides)]
+        if kind >= 0.45 and radius > 4:  # a smaller ring on top, as floating roofs and vents have
+            inner = lids[0] * [0.35, 0.35, 1.0] + np.array([0.0, 0.0, 0.15])
+            self.faces.append(Face(place.put(inner), (), OBJECT, 0, 0, self.kit.draw(rng, "metal"), shade))
 
     def car(self, x: float, y: float, angle: float) -> None:
         """A car or van: body, cabin."""

@@ -121,7 +121,7 @@ def centre(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
     """Town blocks: recursive lots, flat roofs of very different heights."""
     rng = site.rng
     site.paint_street(s0, t0, s1, t1, pick(rng, ["pavement", "asphalt", "lawn"]))
-    top = rng.uniform(8, 34)
+    top = rng.uniform(8, 34) if rng.random() < 0.85 else rng.uniform(34, 58)
     lot = rng.uniform(14, 38)
 
     def fill(a: float, b: float, c: float, d: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from kibs_steps.simulate import roofs
 from kibs_steps.simulate.dwellings import village
 from kibs_steps.simulate.outdoors import parking
-from kibs_steps.simulate.pieces import CLUTTER, ROOF, Face, pick
+from kibs_steps.simulate.pieces import CLUTTER, OBJECT, ROOF, Face, Place, pick
 from kibs_steps.simulate.roofs import wing
 from kibs_steps.simulate.site import Site
 
@@ -119,7 +119,11 @@ def farm(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
         a, b = min(s1 - s0, rng.uniform(35, 70)), min(t1 - t0, rng.uniform(30, 60))
         x, y = rng.uniform(s0, s1 - a), rng.uniform(t0, t1 - b)
         site.paint_street(x, y, x + a, y + b, pick(rng, ["gravel", "rough", "soil", "pavement"]))
-        village(site, x, y, x + a, y + b) if rng.random() < 0.5 else _barns(site, x, y, x + a, y + b)
+        what = rng.random()
+        if what < 0.15:
+            _greenhouses(site, x, y, x + a, y + b)
+        else:
+            village(site, x, y, x + a, y + b) if what < 0.55 else _barns(site, x, y, x + a, y + b)
     site.trees(s0, t - 2, s1, t + 2, 3 * site.leafy * rng.random(), 9)
 
 
@@ -153,3 +157,72 @@ def _barns(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
         )
         if rng.random() < 0.4:
             site.tank(site.place(s0 + a + 5, t), rng.uniform(1.5, 4), rng.uniform(4, 12))
+
+
+def _greenhouses(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
+    """Glass bays side by side: no sections."""
+    rng = site.rng
+    site.paint_street(s0, t0, s1, t1, pick(rng, ["gravel", "soil", "pavement"]))
+    glass, bay = site.kit.draw(rng, "greenhouse"), rng.uniform(3.0, 8.0)
+    low, rise = rng.uniform(2.2, 4.5), bay * rng.uniform(0.1, 0.25)
+    for t in np.arange(t0 + 2, t1 - 2 - bay, bay):
+        half, deep = (s1 - s0) / 2 - 3, bay / 2
+        place = site.place((s0 + s1) / 2, t + deep)
+        ring = np.array(roofs.rectangle(-half, -deep, half, deep))
+        if half < 2 or not site.inside(place.x, place.y, half) or not site.free(place, [ring]):
+            continue
+        site.occupy(place, [ring])
+        place = site.grounded(place, ring)
+        faces = roofs.sections([wing("gable", -half, -deep, half, deep, low, rise / deep)])
+        shade = site.tint(0.06)
+        site.faces += [Face(place.put(f), (), OBJECT, 0, 0, glass, shade) for f in (*faces, *roofs.walls(faces))]
+
+
+def harbour(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
+    """A quay and water: ships, containers, cranes, sheds, tanks."""
+    rng = site.rng
+    site.paint_street(s0, t0, s1, t1, pick(rng, ["pavement", "asphalt", "gravel"]))
+    edge = t0 + (t1 - t0) * rng.uniform(0.3, 0.65)
+    site.paint_street(s0, edge, s1, t1, "water", 0.1)
+    site.paint_street(s0, edge - 1, s1, edge, "pavement", 0.2)
+    s = s0 + rng.uniform(0, 20)
+    while s < s1 - 10:
+        half, wide = rng.uniform(6, 38), rng.uniform(2.2, 8)
+        if rng.random() < 0.75 and edge + 2 * wide + 3 < t1:
+            _ship(site, site.place(s + half, edge + wide + rng.uniform(0.5, 3), pick(rng, [0, np.pi])), half, wide)
+        s += 2 * half + rng.uniform(3, 25)
+    for _ in range(int(rng.integers(0, 4))):
+        _ship(
+            site,
+            site.place(rng.uniform(s0, s1), rng.uniform(edge + 8, max(edge + 9, t1)), rng.uniform(0, 6)),
+            rng.uniform(3, 9),
+            1.8,
+        )
+    for a in np.arange(s0 + 3, s1 - 15, 30.0):
+        if rng.random() < 0.4:
+            _yard(site, a, max(t0, edge - 16), a + 26, edge - 2)
+    if rng.random() < 0.4:
+        mast = site.place(rng.uniform(s0, s1), edge - 4, rng.uniform(0, 6))
+        for length, wide, low, high in ((2.0, 2.0, 0.0, 22.0), (18.0, 0.6, 20.0, 21.2)):
+            site.box(mast, np.array(roofs.rectangle(-2.0, -wide, length, wide)), high, "car", low=low)
+    if edge - t0 > 28:
+        industry(site, s0, t0, s1, edge - 17)
+
+
+def _ship(site: Site, place: Place, half: float, wide: float) -> None:
+    """A hull with a deck, hatches and a bridge."""
+    rng = site.rng
+    bow = min(half * 0.35, 3 * wide)
+    hull = np.array([[-half, -0.8 * wide], [half - bow, -wide], [half, 0], [half - bow, wide], [-half, 0.8 * wide]])
+    side = rng.uniform(1.0, 1.5 + 0.35 * wide)
+    site.box(place, hull, side, "hull")
+    site.box(place, 0.93 * hull, side + 0.15, "deck", low=side)
+    for _ in range(int(rng.integers(1, 4 + half // 6))):
+        x, y = rng.uniform(-0.8, 0.6) * half, rng.uniform(-0.4, 0.4) * wide
+        a, b = rng.uniform(0.03, 0.2) * half + 0.5, rng.uniform(0.15, 0.6) * wide
+        use = pick(rng, ["box", "box", "metal", "deck", "car"])
+        site.box(
+            place, np.array(roofs.rectangle(x - a, y - b, x + a, y + b)), side + rng.uniform(0.4, 3), use, low=side
+        )
+    bridge = np.array(roofs.rectangle(-0.9 * half, -0.7 * wide, -0.9 * half + max(2.0, 0.2 * half), 0.7 * wide))
+    site.box(place, bridge, side + rng.uniform(2, 9) * min(1.0, half / 20), "metal", low=side)
