@@ -95,14 +95,23 @@ def write_by_block(path: str | Path, tables: dict[str, pa.Table]) -> None:
 
 
 def read_table(path: str | Path, columns: list[str] | None = None, block: str | None = None) -> pa.Table:
-    """Read a Parquet table, or one block's rows of it (without the column `block`); damage raises `DamagedFile`."""
+    """Read a Parquet table, or one block's rows of it (without the column `block`); damage raises `DamagedFile`.
+
+    By `ParquetFile`: `pyarrow.parquet.read_table` imports pyarrow's data sets, and with them pandas.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        if block is not None:
-            return pq.read_table(path, columns=columns, filters=[("block", "=", block)]).drop_columns(["block"])
-        return pq.read_table(path, columns=columns)
+        with pq.ParquetFile(path) as source:
+            if block is None:
+                return source.read(columns)
+            key = source.schema_arrow.names.index("block")
+            facts = [source.metadata.row_group(i) for i in range(source.num_row_groups)]
+            mine = [i for i, g in enumerate(facts) if g.num_rows and g.column(key).statistics.min == block]
+            table = source.read_row_groups(mine, columns) if mine else source.schema_arrow.empty_table()
+            kept = [name for name in columns or table.column_names if name != "block"]
+            return table.select(kept)
     except (pa.ArrowInvalid, OSError) as error:
         if isinstance(error, FileNotFoundError):
             raise
