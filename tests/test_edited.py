@@ -50,7 +50,8 @@ def run(tmp_path, world, layer, crs=None):
     store.write_table(tmp_path / "corners.parquet", corners)
     out = tmp_path / "sections.parquet", tmp_path / "edited_corners.parquet"
     edited.main(
-        ["--scene", str(facts.folder / "scene.json"), "--layer", str(tmp_path / "edit.gpkg"), "--stitched", str(tmp_path / "stitched.parquet"),
+        ["--scene", str(facts.folder / "scene.json"), "--layer", str(tmp_path / "edit.gpkg"),
+         "--stitched", str(tmp_path / "stitched.parquet"),
          "--found", str(tmp_path / "corners.parquet"), "--tile", "120", "--margin", "10", "--block", "1", "--reach", "7.5",
          "--sections", str(out[0]), "--corners", str(out[1])]
     )  # fmt: skip

@@ -145,3 +145,21 @@ def test_angles_come_from_metadata(files):
     ((_, full),) = plan.scenes({"scene": "s", "raster": str(files[1]), "dtm": 0, "models": str(folder / "a"),
                                 "metadata": str(folder / "a.IMD"), **config}, SCHEMA).items()  # fmt: skip
     assert plan.plan("s", full, folder, folder / "results").settings["view_azimuth"] == 181.1
+
+
+def test_a_simulated_city_reruns_with_its_file(files):
+    folder, _ = files
+    city = folder / "c.city.json"
+    scene = {"simulate": {"seed": 1, "size": 200, "city": str(city)}, "models": str(folder / "a")}
+    scene = {**scene, **toy.VIEW, "sun_azimuth": 155, "sun_elevation": 45}
+
+    def sources():
+        ((name, full),) = plan.scenes({"scenes": {"d": scene}}, SCHEMA).items()
+        return plan.plan(name, full, folder, folder / "results").signature["source"]
+
+    with pytest.raises(BadConfig, match="is not there"):
+        sources()
+    city.write_text("{}")
+    first = sources()
+    city.write_text("{ }")
+    assert sources() != first

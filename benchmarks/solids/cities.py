@@ -131,13 +131,21 @@ def _sections(outlines: np.ndarray, ids: np.ndarray, owned: bool = True) -> pa.T
     n = len(ids)
     columns = [ids, shapely.to_wkb(outlines), np.ones(n), np.full(n, 2), np.zeros(n, bool), np.zeros(n, bool)]
     columns.append(ids if owned else np.zeros(n, np.int64))
-    return pa.table([pa.array(c, f.type) for c, f in zip(columns, stitch.SECTIONS, strict=True)], schema=stitch.SECTIONS)
+    return pa.table(
+        [pa.array(c, f.type) for c, f in zip(columns, stitch.SECTIONS, strict=True)], schema=stitch.SECTIONS
+    )
 
 
 def _corners(xyz: np.ndarray, sigma: float, owner: np.ndarray) -> pa.Table:
     rows = np.unique(np.column_stack([xyz, owner]), axis=0)
     n = len(rows)
-    names = {"col": rows[:, 0], "row": rows[:, 1], "height": rows[:, 2], "sigma": np.full(n, sigma), "score": np.ones(n)}
+    names = {
+        "col": rows[:, 0],
+        "row": rows[:, 1],
+        "height": rows[:, 2],
+        "sigma": np.full(n, sigma),
+        "score": np.ones(n),
+    }
     return pa.table({**names, "owner": rows[:, 3].astype(np.int64)})
 
 
@@ -185,8 +193,11 @@ def measured(city: World, found: list[tuple[dict, Any, Any]], seconds: float) ->
         "volume": float(np.median(volume)) if len(volume) else None,
         "volumes compared": len(volume),
         "ms per building": 1000 * seconds / max(len(found), 1),
-        "reasons": dict(Counter(row["lod_reason"].split(": ", 1)[-1][:60] for row, _, _ in found if
-        row["lod_reason"]).most_common(5)),
+        "reasons": dict(
+            Counter(row["lod_reason"].split(": ", 1)[-1][:60] for row, _, _ in found if row["lod_reason"]).most_common(
+                5
+            )
+        ),
     }
 
 
@@ -213,7 +224,9 @@ def corner_errors(city: World, found: list[tuple[dict, Any, Any]]) -> tuple[np.n
 def volume_errors(city: World, found: list[tuple[dict, Any, Any]]) -> np.ndarray:
     """Relative errors of the volumes of buildings that are at least `SEEN` visible, counted on a raster of the true roofs."""
     left, bottom, right, top = city.facts.grid.bounds
-    frame = Grid(city.facts.grid.crs, left - 40, top + 40, CELL, int((right - left + 80) / CELL), int((top - bottom + 80) / CELL))
+    frame = Grid(
+        city.facts.grid.crs, left - 40, top + 40, CELL, int((right - left + 80) / CELL), int((top - bottom + 80) / CELL)
+    )
     rings = [zbuffer.Polygon(*_rings(shape)) for shape in city.standing]
     hits = zbuffer.render_faces(rings, (0.0, 0.0), frame)
     ids = city.table["truth_id"].to_numpy()
@@ -242,17 +255,26 @@ def _rings(shape: shapely.Polygon) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
 
 def table_of(rows: dict[str, dict[str, Any]], first: str) -> str:
     """Figures as a Markdown table."""
-    head = f"| {first} | buildings | LOD 2.0 / 1.3 / 1.2 / 0 | faulty | LOD2 by the criterion | corners | heights | volume:
-    median error, within 2 % | ms |"
-    lines = [head, "|---" * 9 + "|"]
+    names = (
+        "buildings",
+        "LOD 2.0 / 1.3 / 1.2 / 0",
+        "faulty",
+        "LOD2 by the criterion",
+        "corners",
+        "heights",
+        "volume",
+        "ms",
+    )
+    lines = [f"| {first} | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for name, r in rows.items():
         lods = " / ".join(str(r["lod"].get(k, 0)) for k in ("2.0", "1.3", "1.2", "0"))
-        volume = "–" if r["volume"] is None else f"{100 * r['volume']:.1f} %, {100 * r['volume within 2 %']:.0f} % of
-        {r['volumes compared']}"
-        lines.append(
-            f"| {name} | {r['buildings']} | {lods} | {r['faulty']} | {100 * r['lod2']:.1f} % | {r['corner']:.2f} m | {r['height']:.2f} m | "
-            f"{volume} | {r['ms per building']:.0f} |"
-        )
+        volume = "–"
+        if r["volume"] is not None:
+            near = f"{100 * r['volume within 2 %']:.0f} % of {r['volumes compared']} within 2 %"
+            volume = f"{100 * r['volume']:.1f} %, {near}"
+        cells = [name, r["buildings"], lods, r["faulty"], f"{100 * r['lod2']:.1f} %", f"{r['corner']:.2f} m"]
+        cells += [f"{r['height']:.2f} m", volume, f"{r['ms per building']:.0f}"]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
 
 

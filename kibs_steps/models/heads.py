@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from kibs_steps.blend import rims
+
 PROMINENCE = 0.2  # of a section's summit, where the contract does not say
 SMOOTH = 0.5  # px: summits one pixel wide are noise
 
@@ -37,7 +39,8 @@ class Corners(NamedTuple):
 def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Sections:
     """Sections of one tile from the outputs of either head."""
     if contract["head"] == "dense":
-        return dense_sections(outputs["roof"][0], outputs["edge"][0], outputs["distance"][0], contract["thresholds"])
+        maps = (outputs["roof"][0], outputs["edge"][0], outputs["distance"][0])
+        return dense_sections(*maps, contract["thresholds"], contract.get("score"))
     return instance_sections(outputs, contract["tile"], contract["thresholds"])
 
 
@@ -50,12 +53,19 @@ def decode_corners(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> 
     return instance_corners(outputs, contract["heights"], contract["thresholds"])
 
 
-def dense_sections(roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, thresholds: dict[str, float]) -> Sections:
+def dense_sections(
+    roof: np.ndarray,
+    edge: np.ndarray,
+    distance: np.ndarray,
+    thresholds: dict[str, float],
+    score: dict[str, float] | None = None,
+) -> Sections:
     """Sections where the distance to the rim rises to a summit of its own, flooded over the roof (watershed).
 
     `roof`, `edge`, `distance` are (s, s) in 0–1. Of all summits of distance − edge those count that rise `prominence` above
     the pass to a higher one. Every roof area is at least one section. Sections under `min_area` px are given to the neighbour
-    they touch most, or dropped when alone.
+    they touch most, or dropped when alone. `score` are the weights of `traits` that tell how likely a section is right;
+    without them its score is its mean roof probability.
     """
     mask = roof > thresholds["roof"]
     if not mask.any():
@@ -64,7 +74,30 @@ def dense_sections(roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, thr
     basins = flood(summits(level, mask), mask, level)
     labels = joined_basins(basins, level, thresholds.get("prominence", PROMINENCE))
     labels = absorb_small(labels, int(thresholds["min_area"]))
-    return Sections(labels, mean_by_label(roof, labels))
+    if score is None:
+        return Sections(labels, mean_by_label(roof, labels))
+    found = traits(labels, roof, edge, distance)
+    logit = sum((score[name] * value for name, value in found.items()), start=np.float64(score["bias"]))
+    return Sections(labels, (1 / (1 + np.exp(-logit))).astype(np.float32))
+
+
+def traits(labels: np.ndarray, roof: np.ndarray, edge: np.ndarray, distance: np.ndarray) -> dict[str, np.ndarray]:
+    """What tells good sections 1…n from bad ones, (n,) each: area (log px), mean roof probability, mean edge on the rim and
+    inside, height of the summit, and the rim's length against that of a square of the same area."""
+    rim = rims(labels)
+    n = int(labels.max(initial=0))
+    area = np.bincount(labels.ravel(), minlength=n + 1)[1:]
+    length = np.bincount(labels[rim], minlength=n + 1)[1:]
+    summit = np.full(n + 1, -np.inf)
+    np.maximum.at(summit, labels.ravel(), (distance - edge).ravel())
+    return {
+        "log_area": np.log(np.maximum(area, 1)),
+        "roof": mean_by_label(roof, labels),
+        "rim": mean_by_label(edge, np.where(rim, labels, 0), n),
+        "inside": mean_by_label(edge, np.where(rim, 0, labels), n),
+        "summit": summit[1:],
+        "rim_length": length**2 / (16.0 * np.maximum(area, 1)),
+    }
 
 
 def summits(level: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -143,9 +176,9 @@ def relabelled(labels: np.ndarray) -> np.ndarray:
     return new[inverse].reshape(labels.shape)
 
 
-def mean_by_label(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Mean of `values` over each label 1…n."""
-    n = int(labels.max(initial=0))
+def mean_by_label(values: np.ndarray, labels: np.ndarray, n: int | None = None) -> np.ndarray:
+    """Mean of `values` over each label 1…n, 0 where a label has no pixel; `n` is the greatest label if not given."""
+    n = int(labels.max(initial=0)) if n is None else n
     total = np.bincount(labels.ravel(), values.ravel().astype(np.float64), n + 1)
     count = np.bincount(labels.ravel(), minlength=n + 1)
     return (total / np.maximum(count, 1))[1:].astype(np.float32)
@@ -177,7 +210,7 @@ def pasted(box: np.ndarray, mask: np.ndarray, size: int) -> tuple[tuple[slice, s
     col = (np.arange(x0, x1) + 0.5 - box[0]) / max(box[2] - box[0], 1e-3) * n - 0.5
     row = (np.arange(y0, y1) + 0.5 - box[1]) / max(box[3] - box[1], 1e-3) * n - 0.5
     grid = np.meshgrid(row, col, indexing="ij")
-    return (slice(y0, y1), slice(x0, x1)), ndimage.map_coordinates(mask, grid, order=1, mode="constant")
+    return (slice(y0, y1), slice(x0, x1)), ndimage.map_coordinates(mask, grid, order=1, mode="grid-constant")
 
 
 def height_moments(distribution: np.ndarray, heights: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -58,11 +58,9 @@ def open_network(model: contracts.Model, geometry: np.ndarray, threads: int = 1)
         outputs = session.run(names, feed)
         return {name: (value[0] if dense else value) for name, value in zip(names, outputs, strict=True)}
 
-    views = (
-        [upright(geometry)]
-        if model.contract.get("upright")
-        else FLIPS[: model.contract.get("flips", 1) if dense else 1]
-    )
+    if not dense:
+        return lambda rgb: run(rgb, geometry)
+    views = [upright(geometry)] if model.contract.get("upright") else FLIPS[: model.contract.get("flips", 1)]
 
     def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
         total: dict[str, np.ndarray] = {}

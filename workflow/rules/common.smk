@@ -158,7 +158,9 @@ def licensed(wildcards):
 
 def using(method):
     """A wildcard constraint: the names of the scenes made by a method, or nothing at all."""
-    names = [re.escape(p.name) for p in PLANS.values() if p.settings["method"] == method]
+    names = [
+        re.escape(p.name) for p in PLANS.values() if p.settings["method"] == method
+    ]
     return "|".join(names) or "(?!)"
 
 
