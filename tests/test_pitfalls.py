@@ -250,7 +250,7 @@ def test_faithful_counts_faces_on_their_planes():
     off = solids.Sections(
         np.arange(1, n + 1),
         polygons,
-        np.array(planes, float) + [(0, 0, 0), (0, 0, 0.3)],
+        np.array(planes, float) + np.array([(0, 0, 0), (0, 0, 0.3)]),
         ["ok"] * n,
         np.full(n, 0.05),
         (0, 0),
