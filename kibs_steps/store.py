@@ -1,14 +1,17 @@
 """How steps write and read their files: whole or not at all, and the same bytes every time.
 
 A file appears under its final name only when it is complete (written under a temporary name beside it, then renamed),
-so a killed job never leaves half a file that looks like a result.
+so a killed job never leaves half a file that looks like a result. Its checksums are written with it, and compared by every
+reader (`sums`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
+import shutil
 import tempfile
 import zipfile
 import zlib
@@ -20,27 +23,51 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from kibs_steps.errors import KibsError
+from kibs_steps import sums
+from kibs_steps.errors import AGAIN, KibsError
+from kibs_steps.sums import DamagedFile  # noqa: F401 (raised by the readers here)
+
+FULL = 1 << 16  # bytes free on a disk that is as good as full
 
 
-class DamagedFile(KibsError):
-    """An intermediate file that cannot be read back."""
+class DiskFull(KibsError):
+    """There is no room for a result."""
 
 
 @contextlib.contextmanager
 def whole(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path with `path`'s suffixes beside it; rename it to `path` when the block ends without error."""
+    """Yield a temporary path with `path`'s suffixes beside it; rename it to `path` when the block ends without error.
+
+    Raises `DiskFull` where the disk has no room for it, also when the library that wrote it did not notice.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=".tmp-", suffix="-" + path.name, dir=path.parent)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=".tmp-", suffix="-" + path.name, dir=path.parent)
+    except OSError as error:
+        raise _told(error, path) from error
     os.close(handle)
     temporary = Path(name)
     temporary.chmod(0o644)
     try:
         yield temporary
+        if shutil.disk_usage(path.parent).free < FULL:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sums.write(path, sums.of_file(temporary))
         os.replace(temporary, path)
+    except Exception as error:
+        raise _told(error, path) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _told(error: Exception, path: Path) -> Exception:
+    """The error as it is, or `DiskFull` where that is behind it."""
+    number = getattr(error, "errno", None)
+    folder = next(f for f in (path.parent, *path.parents) if f.is_dir())
+    if number in (errno.ENOSPC, errno.EDQUOT) or shutil.disk_usage(folder).free < FULL:
+        return DiskFull(f"no space left for {path}: free some of the disk, then {AGAIN}")
+    return error
 
 
 def write_json(path: str | Path, content: Any) -> None:
@@ -53,10 +80,11 @@ def write_json(path: str | Path, content: Any) -> None:
 
 def read_json(path: str | Path) -> Any:
     """Read a JSON file; a file that is not JSON raises `DamagedFile`."""
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise DamagedFile(f"{path} is not readable JSON ({error}): delete it and run the same command again") from error
+    with sums.opened(path) as source:
+        try:
+            return json.load(source)
+        except ValueError as error:
+            raise sums.damaged(path, error) from error
 
 
 def write_table(path: str | Path, table: pa.Table) -> None:
@@ -76,14 +104,13 @@ def write_by_block(path: str | Path, tables: dict[str, pa.Table]) -> None:
 
 def read_table(path: str | Path, columns: list[str] | None = None, block: str | None = None) -> pa.Table:
     """Read a Parquet table, or one block's rows of it (without the column `block`); damage raises `DamagedFile`."""
-    try:
-        if block is not None:
-            return pq.read_table(path, columns=columns, filters=[("block", "=", block)]).drop_columns(["block"])
-        return pq.read_table(path, columns=columns)
-    except (pa.ArrowInvalid, OSError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        raise DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error
+    with sums.opened(path) as source:
+        try:
+            if block is not None:
+                return pq.read_table(source, columns=columns, filters=[("block", "=", block)]).drop_columns(["block"])
+            return pq.read_table(source, columns=columns)
+        except (pa.ArrowInvalid, OSError) as error:
+            raise sums.damaged(path, error) from error
 
 
 def write_arrays(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
@@ -94,8 +121,9 @@ def write_arrays(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
     """Read named arrays; a damaged file raises `DamagedFile`."""
-    try:
-        with np.load(path, allow_pickle=False) as source:
-            return {name: source[name] for name in source.files}
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error
+    with sums.opened(path) as file:
+        try:
+            with np.load(file, allow_pickle=False) as source:
+                return {name: source[name] for name in source.files}
+        except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise sums.damaged(path, error) from error

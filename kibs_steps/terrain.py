@@ -36,10 +36,11 @@ def flat(height: float) -> Terrain:
 
 def read(path: str | Path, bounds: tuple[float, float, float, float], margin: float = 200.0) -> Terrain:
     """The part of a scene's `dtm.tif` within `margin` metres of `bounds` (left, bottom, right, top)."""
-    import rasterio
     from rasterio.windows import Window
 
-    with rasterio.open(path) as source:
+    from kibs_steps import raster
+
+    with raster.opened(path) as source:
         t = source.transform
         left, right = (bounds[0] - margin - t.c) / t.a, (bounds[2] + margin - t.c) / t.a
         top, bottom = (bounds[3] + margin - t.f) / t.e, (bounds[1] - margin - t.f) / t.e
