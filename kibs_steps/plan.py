@@ -14,11 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kibs_steps import fingerprint
-from kibs_steps.errors import KibsError
+from kibs_steps import settings as user_settings
 from kibs_steps.grid import Block, Tiling
 from kibs_steps.models import contract
+from kibs_steps.settings import BadConfig
 
 RUN_KEYS = ("scene", "scenes", "train")
+DETECTING = ("tiles", "sections", "blend", "corners", "feed")
+STANDING = ("planes", "ground")
+BLOCK_STEPS = (*DETECTING, *STANDING, "solids")  # steps with a job per block, in the order of the data
 DEFAULTS = {
     "models": "research",
     "method": "two_stage",
@@ -35,12 +39,11 @@ REACH = 7.5  # px: half the paper's corner square q = 15, unless the model's con
 TOLERANCE = 1.5  # px: how far smoothing may move a pixel outline
 
 
-class BadConfig(KibsError):
-    """The configuration cannot be used."""
-
-
 class Plan(NamedTuple):
-    """One scene: settings (defaults filled in), its files, grid size, tiles, blocks, models and signatures by step."""
+    """One scene: settings (defaults filled in), its files, grid size, tiles, blocks, models and signatures by step.
+
+    `left_out` are the blocks the city is made without, each from a step on.
+    """
 
     name: str
     settings: dict[str, Any]
@@ -52,6 +55,12 @@ class Plan(NamedTuple):
     models: dict[str, contract.Model]
     signature: dict[str, str]
     warnings: list[str]
+    left_out: dict[str, str]
+
+    def having(self, step: str) -> list[Block]:
+        """The blocks that are not left out at that step or before."""
+        done = BLOCK_STEPS[: BLOCK_STEPS.index(step) + 1]
+        return [b for b in self.blocks if self.left_out.get(b.name) not in done]
 
     @property
     def terrain_files(self) -> list[str]:
@@ -75,13 +84,7 @@ class Plan(NamedTuple):
 
 def scenes(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of every scene to build, by name, after the schema; defaults are filled in. Raises `BadConfig`."""
-    import jsonschema
-
-    check = jsonschema.Draft202012Validator(schema)
-    error = jsonschema.exceptions.best_match(check.iter_errors(config))
-    if error:
-        place = ".".join(map(str, error.absolute_path)) or "config"
-        raise BadConfig(f"{place}: {error.message}")
+    user_settings.check(config, schema)
     common = {k: v for k, v in config.items() if k not in RUN_KEYS}
     listed = config.get("scenes") or {}
     wanted = [str(config["scene"])] if config.get("scene") else list(listed)
@@ -89,7 +92,7 @@ def scenes(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, dict[str
         raise BadConfig(
             "no scene to build: add one under `scenes:` in config.yaml, or give --config scene=NAME raster=FILE"
         )
-    return {name: {**DEFAULTS, **(listed.get(name) or {}), **common} for name in wanted}
+    return {str(name): {**DEFAULTS, **(listed.get(name) or {}), **common} for name in wanted}
 
 
 def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan:
@@ -138,9 +141,24 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     if settings["feed"] == "truth" and not truth:
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
     blocks = tiling.blocks(width, height)
-    signature = signatures(settings, source, truth_source, models, tiling, cache)
+    left_out = leaving_out(name, str(settings.get("leave_out") or ""), blocks)
+    signature = signatures(settings, source, truth_source, models, tiling, cache, left_out)
     warnings = [] if settings["feed"] == "truth" else angle_warnings(settings, models)
-    return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings)
+    return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings, left_out)
+
+
+def leaving_out(name: str, text: str, blocks: list[Block]) -> dict[str, str]:
+    """The blocks of one scene that `leave_out=SCENE/BLOCK/STEP,…` names, with the step each is left out from."""
+    found = {}
+    for item in filter(None, text.split(",")):
+        scene, block, step = [*item.split("/"), "", ""][:3]
+        if step not in BLOCK_STEPS:
+            raise BadConfig(f"leave_out: {item}: give SCENE/BLOCK/STEP, the step one of {', '.join(BLOCK_STEPS)}")
+        if scene == name:
+            if block not in {b.name for b in blocks}:
+                raise BadConfig(f"leave_out: {item}: the scene has blocks {blocks[0].name} to {blocks[-1].name}")
+            found[block] = step
+    return dict(sorted(found.items()))
 
 
 def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) -> list[str]:
@@ -172,10 +190,20 @@ def grid_size(raster: str, gsd: float, aoi: str | None) -> tuple[int, int]:
 
 
 def signatures(
-    settings: dict[str, Any], source: Any, truth: Any, models: dict[str, contract.Model], tiling: Tiling, cache: Path
+    settings: dict[str, Any],
+    source: Any,
+    truth: Any,
+    models: dict[str, contract.Model],
+    tiling: Tiling,
+    cache: Path,
+    left_out: dict[str, str],
 ) -> dict[str, str]:
     """Signature of every step: each hashes what it uses itself and the signatures it builds on."""
     h = fingerprint.of_values
+
+    def without(*steps: str) -> list[str]:
+        return sorted(block for block, step in left_out.items() if step in steps)
+
     pick = {k: settings.get(k) for k in settings}
 
     def some(*keys: str) -> list[Any]:
@@ -204,10 +232,13 @@ def signatures(
     s["corners"] = h(s["blend"], seen["corners"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.
-    s["stitch"] = h(s["feed"] if settings["feed"] == "truth" else s["corners"], models["corners"].sha256)
+    s["stitch"] = h(
+        s["feed"] if settings["feed"] == "truth" else s["corners"], models["corners"].sha256, without(*DETECTING)
+    )
     s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
-    s["buildings"] = h(s["planes"], content("footprints"))
+    s["buildings"] = h(s["planes"], content("footprints"), without(*STANDING))
     s["solids"] = h(s["buildings"], settings["lod_label"])
-    s["evaluate"] = h(s["planes"], s["truth"])
-    s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
+    s["publish"] = h(s["solids"], without("solids"))
+    s["evaluate"] = h(s["planes"], s["truth"], without(*STANDING))
+    s["run"] = h(s["publish"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
     return s

@@ -23,6 +23,7 @@ rule sections:
         seams="results/{scene}/blocks/{block}/detected/seams.npz",
     log:
         "results/{scene}/logs/sections/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -48,6 +49,7 @@ rule blend:
         temp("results/{scene}/blocks/{block}/blended.tif"),
     log:
         "results/{scene}/logs/blend/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -71,6 +73,7 @@ rule corners:
         "results/{scene}/blocks/{block}/detected/corners.parquet",
     log:
         "results/{scene}/logs/corners/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -93,6 +96,7 @@ rule truth:
         "results/{scene}/truth.parquet",
     log:
         "results/{scene}/logs/truth.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -125,6 +129,7 @@ rule feed:
         corners="results/{scene}/blocks/{block}/fed/corners.parquet",
     log:
         "results/{scene}/logs/feed/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -154,6 +159,7 @@ rule stitch:
         corners="results/{scene}/stitched/corners.parquet",
     log:
         "results/{scene}/logs/stitch.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -162,7 +168,8 @@ rule stitch:
         tolerance=lambda w: plan(w).tolerance,
         reach=lambda w: plan(w).reach,
         folders=lambda w: [
-            f"results/{w.scene}/blocks/{b.name}/{source(w)}" for b in plan(w).blocks
+            f"results/{w.scene}/blocks/{b.name}/{source(w)}"
+            for b in plan(w).having("feed")
         ],
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"

@@ -1,7 +1,7 @@
 # The published files, one rule per format.
 
 
-given = inputs("solids", "results/{scene}/city.gpkg")
+given = inputs("publish", "results/{scene}/city.gpkg")
 
 
 rule geopackage:
@@ -9,8 +9,8 @@ rule geopackage:
     input:
         scene=given("results/{scene}/scene.json"),
         sections=given("results/{scene}/buildings.parquet"),
-        solids=given(blocks("solids.parquet")),
-        corners=given(blocks("filed_corners.parquet")),
+        solids=given(blocks("solids.parquet", "solids")),
+        corners=given(blocks("filed_corners.parquet", "ground")),
         models=given(licensed),
     output:
         "results/{scene}/city.gpkg",
@@ -19,17 +19,18 @@ rule geopackage:
     conda:
         RUN
     params:
-        signature=signature("solids"),
+        signature=signature("publish"),
         tiling=lambda w: plan(w).tiling,
+        blocks=failed,
     shell:
         "python -m kibs_steps.publish.geopackage --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --sections {input.sections:q}"
-        " --solids {input.solids:q} --corners {input.corners:q} --models {input.models:q}"
+        " --solids {input.solids:q} --corners {input.corners:q} --models {input.models:q} {params.blocks:q}"
         " --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs(
-    "solids", "results/{scene}/city.city.json", "results/{scene}/city.city.jsonl"
+    "publish", "results/{scene}/city.city.json", "results/{scene}/city.city.jsonl"
 )
 
 
@@ -37,7 +38,7 @@ rule cityjson:
     """city.city.json and city.city.jsonl."""
     input:
         scene=given("results/{scene}/scene.json"),
-        solids=given(blocks("solids.city.jsonl")),
+        solids=given(blocks("solids.city.jsonl", "solids")),
         models=given(licensed),
     output:
         city="results/{scene}/city.city.json",
@@ -47,7 +48,7 @@ rule cityjson:
     conda:
         RUN
     params:
-        signature=signature("solids"),
+        signature=signature("publish"),
     shell:
         "python -m kibs_steps.publish.cityjson --scene {input.scene:q} --solids {input.solids:q}"
         " --models {input.models:q} --out {output.city:q} --seq {output.sequence:q} > {log:q} 2>&1"
@@ -128,7 +129,7 @@ rule record:
         sources=given(lambda w: [plan(w).raster, *plan(w).terrain_files]),
         models=given(licensed),
         sections=given("results/{scene}/buildings.parquet"),
-        solids=given(blocks("solids.parquet")),
+        solids=given(blocks("solids.parquet", "solids")),
     output:
         "results/{scene}/run.json",
     log:
@@ -138,7 +139,8 @@ rule record:
     params:
         signature=signature("run"),
         settings=lambda w: json.dumps(plan(w).settings),
+        blocks=failed,
     shell:
         "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} --models {input.models:q}"
         " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"
-        " --out {output:q} > {log:q} 2>&1"
+        " {params.blocks:q} --out {output:q} > {log:q} 2>&1"

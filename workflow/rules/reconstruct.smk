@@ -21,6 +21,7 @@ rule planes:
         filed="results/{scene}/blocks/{block}/filed_corners.parquet",
     log:
         "results/{scene}/logs/planes/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -46,6 +47,7 @@ rule ground:
         "results/{scene}/blocks/{block}/ground.parquet",
     log:
         "results/{scene}/logs/ground/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -61,7 +63,7 @@ rule buildings:
     """Group the sections of all blocks to buildings."""
     input:
         scene=given("results/{scene}/scene.json"),
-        ground=given(blocks("ground.parquet")),
+        ground=given(blocks("ground.parquet", "ground")),
         footprints=given(
             lambda w: [f for f in [plan(w).settings.get("footprints")] if f]
         ),
@@ -69,6 +71,7 @@ rule buildings:
         "results/{scene}/buildings.parquet",
     log:
         "results/{scene}/logs/buildings.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -99,6 +102,7 @@ rule solids:
         attributes="results/{scene}/blocks/{block}/solids.parquet",
     log:
         "results/{scene}/logs/solids/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
