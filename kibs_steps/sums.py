@@ -183,13 +183,12 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
     """
     try:
         raw = Checked(path)
+    except FileNotFoundError as error:
+        raise gone(path) from error
+    try:
         with io.BufferedReader(raw, CHUNK) as file:
             raw.begin()
             yield file
-    except FileNotFoundError as error:
-        if Path(path).exists():
-            raise
-        raise gone(path) from error
     except Exception:
         if not raw.wrong:
             raise

@@ -23,6 +23,7 @@ def planned():
         schema = settings.read(
             Path(workflow.basedir, "workflow/schemas/config.schema.yaml")
         )
+        user_inputs.writable(RESULTS)
         found = {
             name: plans.plan(name, values, Path(workflow.basedir), RESULTS)
             for name, values in plans.scenes(config, schema).items()
