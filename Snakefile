@@ -1,7 +1,10 @@
 # KIBS: one off-nadir raster and a terrain model to a LOD2 city. Start with `snakemake --cores 2`; see README.md.
 from pathlib import Path
 
+from kibs_steps import cli, settings
+
 if Path("config.yaml").is_file():
+    cli.or_exit(settings.read, "config.yaml")
 
     configfile: "config.yaml"
 

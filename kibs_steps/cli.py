@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Callable
+from typing import Any
 
 from kibs_steps.errors import AGAIN, KibsError
 
@@ -23,6 +24,17 @@ def run(main: Callable[[], None]) -> None:
             text = f"{type(error).__name__} ({error}): a mistake in KIBS; please report it with the lines above"
         print(f"error: {text}", file=sys.stderr)
         raise SystemExit(1) from None
+
+
+def or_exit(function: Callable, *arguments: Any) -> Any:
+    """What a function returns; where it raises a user's error, the process ends with one line that says what to do."""
+    try:
+        return function(*arguments)
+    except Exception as error:
+        text = told(error)
+        if text is None:
+            raise
+        raise SystemExit(f"error: {text}") from None
 
 
 def told(error: Exception) -> str | None:

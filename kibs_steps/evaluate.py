@@ -97,7 +97,7 @@ def read_through(scene: Scene, sections: Truth, labels: str, heights: str, fallb
             place = RasterWindow(window.col, window.row, window.width, window.height)
             predicted, z = label_file.read(1, window=place), height_file.read(1, window=place)
             seen, true = truth.visible_labels(sections, scene, window.grown(2))
-            corners.append(_truth_corners(sections, seen, window))
+            corners.append(truth_corners(sections, seen, window))
             seen, true = seen[2:-2, 2:-2], true[2:-2, 2:-2]
             pairs.append(metrics.count_pairs(seen, predicted))
 
@@ -142,7 +142,7 @@ def _lookup(ids: NDArray[np.int64], values: NDArray, missing: Any):
     return of
 
 
-def _truth_corners(sections: Truth, seen: NDArray[np.int32], window: Window) -> metrics.Corners:
+def truth_corners(sections: Truth, seen: NDArray[np.int32], window: Window) -> metrics.Corners:
     """The corners of truth sections in a window. One can be seen if its section shows within a pixel of it.
 
     `seen` are labels of the window grown by 2 px.

@@ -16,16 +16,17 @@ from typing import Any, NamedTuple
 from kibs_steps import fingerprint
 from kibs_steps import settings as user_settings
 from kibs_steps.grid import Block, Tiling
-from kibs_steps.models import contract
+from kibs_steps.models import contract, suite
 from kibs_steps.settings import BadConfig
 
 RUN_KEYS = ("scene", "scenes", "train")
-DETECTING = ("tiles", "sections", "blend", "corners", "feed")
+DETECTING = ("tiles", "sections", "blend", "corners", "single", "feed")
 STANDING = ("planes", "ground")
 BLOCK_STEPS = (*DETECTING, *STANDING, "solids")  # steps with a job per block, in the order of the data
 DEFAULTS = {
     "models": "research",
     "method": "two_stage",
+    "mode": "default",
     "planes": "robust",
     "block": 8,
     "feed": "models",
@@ -35,6 +36,8 @@ DEFAULTS = {
     "lod_label": "2.0",
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
+TASKS = {"two_stage": ("sections", "corners"), "single": ("both",)}
+PAPER_MODE = {"planes": "paper"}  # besides the stride and the rule at seams
 REACH = 7.5  # px: half the paper's corner square q = 15, unless the model's contract says otherwise
 TOLERANCE = 1.5  # px: how far smoothing may move a pixel outline
 
@@ -72,6 +75,11 @@ class Plan(NamedTuple):
         return []
 
     @property
+    def seam_rule(self) -> str:
+        """Which pieces of neighbouring tiles are one section: `sections.links_across`."""
+        return "touch" if self.settings["mode"] == "paper" else "overlap"
+
+    @property
     def reach(self) -> float:
         """How far a corner may lie from its section, px."""
         return self.models["corners"].contract["thresholds"].get("corner_radius", REACH)
@@ -102,13 +110,13 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
-    models = {
-        task: contract.load(folder_of(settings["models"], base) / f"{task}.onnx", task)
-        for task in ("sections", "corners")
-    }
-    contract.agree(list(models.values()))
+    if settings["mode"] == "paper":
+        settings = {**settings, **PAPER_MODE}
+    models = models_for(settings, base)
     terms = models["sections"].contract
-    tiling = Tiling(terms["tile"], terms["margin"], int(settings["block"]))
+    # The paper's tiles overlap by p in all, ours by p on each side (PAPER, finding 6).
+    margin = terms["margin"] // 2 if settings["mode"] == "paper" else terms["margin"]
+    tiling = Tiling(terms["tile"], margin, int(settings["block"]))
     cache = results / ".fingerprints.json"
     folder = results / name
     simulated = settings.get("simulate")
@@ -122,8 +130,13 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
         if abs(simulated["gsd"] / terms["gsd"] - 1) > 0.005:
             raise BadConfig(f"scene {name}: simulate.gsd {simulated['gsd']} m, the models work at {terms['gsd']} m")
         width = height = int(simulated["size"])
+        city = simulated.get("city")
+        if city and not Path(city).is_file():
+            raise BadConfig(f"scene {name}: simulate.city {city} is not there: name a CityJSON file")
         source = fingerprint.of_values(
-            simulated, [settings[f"{k}_{a}"] for k in ("view", "sun") for a in ("azimuth", "elevation")]
+            {k: v for k, v in simulated.items() if k != "city"},
+            *([fingerprint.of_file(city, cache)] if city else []),
+            [settings[f"{k}_{a}"] for k in ("view", "sun") for a in ("azimuth", "elevation")],
         )
         truth_source = source
     else:
@@ -161,17 +174,38 @@ def leaving_out(name: str, text: str, blocks: list[Block]) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def direction(settings: dict[str, Any], name: str) -> dict[str, float] | None:
+    """Azimuth and elevation (deg) of `view` or `sun`, None unless both are given."""
+    angles = {angle: settings.get(f"{name}_{angle}") for angle in ("azimuth", "elevation")}
+    return angles if None not in angles.values() else None
+
+
+def models_for(settings: dict[str, Any], base: Path) -> dict[str, contract.Model]:
+    """The models of a scene for `sections` and `corners` (one model twice where the method is `single`).
+
+    Of a suite the set that fits the scene's GSD and angles is taken.
+    """
+    found = suite.sets(folder_of(settings["models"], base), TASKS[settings["method"]])
+    if len(found) > 1:
+        simulated = settings.get("simulate")
+        gsd = {**SIMULATED, **simulated}["gsd"] if simulated else own_gsd(settings.get("raster"))
+        chosen = suite.choose(found, gsd, direction(settings, "view"), direction(settings, "sun"))
+    else:
+        (chosen,) = found
+    return {task: chosen.get(task) or chosen["both"] for task in ("sections", "corners")}
+
+
+def own_gsd(raster: str | None) -> float | None:
+    """Pixel side (m) of a raster, None where there is none to read: that is refused later, with what to do."""
+    from kibs_steps import scene
+
+    return scene.own_gsd(raster) if raster and Path(raster).exists() else None
+
+
 def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) -> list[str]:
     """What the models say of the scene's angles; raises `contract.AngleOutsideTraining` where they refuse them."""
-
-    def direction(name: str) -> dict[str, float] | None:
-        angles = {angle: settings.get(f"{name}_{angle}") for angle in ("azimuth", "elevation")}
-        return angles if None not in angles.values() else None
-
-    found = [
-        contract.check_angles(model, direction("view"), direction("sun"), settings["allow_angles"])
-        for model in models.values()
-    ]
+    view, sun = direction(settings, "view"), direction(settings, "sun")
+    found = [contract.check_angles(model, view, sun, settings["allow_angles"]) for model in models.values()]
     return list(dict.fromkeys(warning for warnings in found for warning in warnings))
 
 
@@ -227,14 +261,15 @@ def signatures(
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
-    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"])
+    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"])
     s["blend"] = h(s["sections"], models["corners"].sha256)
     s["corners"] = h(s["blend"], seen["corners"])
+    s["single"] = h(s["sections"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.
-    s["stitch"] = h(
-        s["feed"] if settings["feed"] == "truth" else s["corners"], models["corners"].sha256, without(*DETECTING)
-    )
+    detected = s["single" if settings["method"] == "single" else "corners"]
+    detected = s["feed"] if settings["feed"] == "truth" else detected
+    s["stitch"] = h(detected, models["corners"].sha256, settings["mode"], without(*DETECTING))
     s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
     s["buildings"] = h(s["planes"], content("footprints"), without(*STANDING))
     s["solids"] = h(s["buildings"], settings["lod_label"])

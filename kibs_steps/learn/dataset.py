@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from kibs_steps.errors import KibsError
+from kibs_steps.models import runtime
 
 GSD = 0.38  # m per px of the models trained here
 GRAPH_GSD = 0.06  # m per px, about, of the roof-graph photographs
@@ -184,6 +185,7 @@ def chip_sample(chip: Chip, rng: np.random.Generator, size: int) -> Sample:
     return sample._replace(
         labels=np.where(building, -1, 0).astype(np.int32),
         roof=building.astype(np.uint8),
+        surface=np.where(building, np.uint8(1), sample.surface),
         # A mask's outline is only as good as its annotator: no corners within 3 px of a building are learned either way.
         corners_known=(cv2.dilate(mask, np.ones((7, 7))) <= 127).astype(np.uint8),
         geometry=NADIR.copy() if rng.random() < 0.4 else sample.geometry,
@@ -214,6 +216,7 @@ def pasted_houses(
     size = ground.rgb.shape[0]
     rgb = ground.rgb.copy()
     labels, roof, known = ground.labels.copy(), ground.roof.copy(), ground.corners_known.copy()
+    surface = ground.surface.copy()
     taken = np.zeros((size, size), np.uint8)
     corners: list[np.ndarray] = []
     label = max(int(labels.max()), 0)
@@ -241,12 +244,12 @@ def pasted_houses(
         picture = np.clip(picture * gain, 0, 255)
         rgb = (alpha[..., None] * picture + (1 - alpha[..., None]) * rgb).astype(np.uint8)
         changed = alpha > 0.15
-        labels[changed], roof[changed], known[changed] = -1, UNKNOWN, 0
+        labels[changed], roof[changed], known[changed], surface[changed] = -1, UNKNOWN, 0, UNKNOWN
         # The ring counts as ground only where the photograph is really shown: elsewhere the old ground keeps its truth.
         sure = (ring > 0) & changed
         labels[sure], roof[sure], known[sure] = 0, 0, 1
         seen = (house > 0) & (inside > 0)
-        labels[seen], roof[seen], known[seen] = own[seen] + label, 1, 1
+        labels[seen], roof[seen], known[seen], surface[seen] = own[seen] + label, 1, 1, 1
         label = max(int(labels.max()), label)
         taken |= ring & inside
         corners.append(vertices[np.unique(np.concatenate(graph.faces))])
@@ -256,6 +259,7 @@ def pasted_houses(
         rgb=rgb,
         labels=labels,
         roof=roof,
+        surface=surface,
         corners=np.concatenate([ground.corners, points]),
         corner_heights=np.concatenate([ground.corner_heights, np.full(len(points), np.nan, np.float32)]),
         corners_known=known,
@@ -312,6 +316,14 @@ def dihedral(sample: Sample, k: int) -> Sample:
     )
 
 
+def upright(sample: Sample, rng: np.random.Generator) -> Sample:
+    """The sample as the network sees tiles (`runtime.upright`): roofs lean up. Where nothing leans, any of its eight views."""
+    turn = int(rng.integers(8))
+    if not sample.geometry[:2].any():
+        return dihedral(sample, turn)
+    return next(s for s in (dihedral(sample, k) for k in range(8)) if runtime.leans_up(*s.geometry[:2]))
+
+
 def window(sample: Sample, row: int, col: int, size: int) -> Sample:
     """The part of a sample from (row, col), `size` px wide and high."""
     part = (slice(row, row + size), slice(col, col + size))
@@ -326,7 +338,7 @@ def window(sample: Sample, row: int, col: int, size: int) -> Sample:
     )
 
 
-def without_geometry(sample: Sample, rng: np.random.Generator, share: float = 0.3) -> Sample:
+def without_geometry(sample: Sample, rng: np.random.Generator, share: float = 0.15) -> Sample:
     """Forgets now the view, now the sun, so that a network learns to do without."""
     geometry = sample.geometry.copy()
     for vector, flag in ((slice(0, 2), 4), (slice(2, 4), 5)):
@@ -428,5 +440,5 @@ class Mixture:
                 sample = with_decoys(sample, other, rng)
             if source == 1:
                 sample = pasted_houses(sample, self.graphs, rng)
-        sample = without_geometry(dihedral(sample, int(rng.integers(8))), rng)
+        sample = upright(without_geometry(sample, rng), rng)
         return sample._replace(rgb=radiometry(sample.rgb, rng))

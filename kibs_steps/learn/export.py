@@ -20,11 +20,11 @@ from kibs_steps.learn.architectures import OUTPUTS, Dense
 from kibs_steps.models import contract as contracts
 
 TILE, MARGIN = 256, 16
-FLIPS = 8  # views a tile is seen in: networks trained briefly gain much from it
 THRESHOLDS = {
-    "sections": {"roof": 0.5, "marker": 0.5, "distance_clip": training.DISTANCE_CLIP, "min_area": 12},
+    "sections": {"roof": 0.5, "prominence": 0.2, "min_area": 12},
     "corners": {"corner": 0.3, "corner_radius": 7.5},
 }
+THRESHOLDS["both"] = THRESHOLDS["sections"] | THRESHOLDS["corners"]
 LICENCE = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
 
 
@@ -43,10 +43,10 @@ def contract_of(task: str, heights: tuple[float, float] | None = None, **facts: 
         "margin": MARGIN,
         "input": {"channels": "RGB", "scale": 1.0, "mean": [127.0] * 3, "std": [128.0] * 3},
         "geometry_input": True,
-        "flips": FLIPS,
+        "upright": True,
         "thresholds": {**THRESHOLDS[task], **facts.get("thresholds", {})},
         "trained_on": {
-            "view_elevation": [50, 90],
+            "view_elevation": [45, 90],
             "view_azimuth": [0, 360],
             "sun_elevation": [20, 70],
             "sun_azimuth": [0, 360],
@@ -60,8 +60,9 @@ def contract_of(task: str, heights: tuple[float, float] | None = None, **facts: 
     }
     contract["trained_on"].update({k: facts[k] for k in ("seed", "commit") if k in facts})
     if task == "corners":
-        mean, sigma = heights or (6.0, 4.0)
         contract["blend"] = training.BLEND
+    if task != "sections":
+        mean, sigma = heights or (6.0, 4.0)
         contract["heights"] = {
             "edges": training.EDGES.tolist(),
             "centres": training.CENTRES.tolist(),
@@ -105,9 +106,10 @@ def export(model: Dense, path: str | Path, contract: dict[str, Any]) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Export the averaged weights of a run."""
+    """Export the averaged weights of a run as the model of one task."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.export", description=main.__doc__)
     parser.add_argument("--checkpoint", required=True)
+    parser.add_argument("--task", choices=list(OUTPUTS), required=True)
     parser.add_argument("--out", required=True, help="ONNX file")
     parser.add_argument("--weights", help="also write the weights here, for other runs to start from (training --init)")
     parser.add_argument("--pool", help="simulated tiles, for the mean corner height")
@@ -116,7 +118,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--commit", help="commit of the training code")
     args = parser.parse_args(argv)
     state = torch.load(args.checkpoint, weights_only=True, map_location="cpu")
-    task = state["settings"]["task"]
+    task = args.task
     model = training.network(task)
     model.load_state_dict(state["average"])
     facts: dict[str, Any] = {"thresholds": args.thresholds, "seed": state["settings"]["seed"]}
@@ -124,7 +126,7 @@ def main(argv: list[str] | None = None) -> None:
         facts["commit"] = args.commit
     if args.metrics:
         facts["metrics"] = store.read_json(args.metrics)
-    heights = corner_height_moments(Path(args.pool)) if args.pool and task == "corners" else None
+    heights = corner_height_moments(Path(args.pool)) if args.pool and task != "sections" else None
     export(model, args.out, contract_of(task, heights, **facts))
     if args.weights:
         halves = {k: v.half() if v.is_floating_point() else v for k, v in state["average"].items()}

@@ -17,16 +17,54 @@ BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None
 
 
 def distance(labels: np.ndarray, clip: float) -> np.ndarray:
-    """Distance of section pixels to their section's rim line, clipped at `clip` px and divided by it: float32 (h, w).
+    """Distance of section pixels to their section's rim line as a share of the section's greatest, float32 (h, w) in 0–1.
 
-    Measured between pixel centres, plus the half pixel from the rim pixel's centre to the line; 0 off sections.
+    Measured between pixel centres, plus the half pixel from the rim pixel's centre to the line; 0 off sections. Where a section
+    is wider than 2·`clip` px the share is of `clip`: so every section has a summit of 1, small ones a small one.
     """
     inner = ((labels > 0) & ~rims(labels)).astype(np.uint8)
     if not inner.all():
         far = cv2.distanceTransform(inner, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     else:
         far = np.full(labels.shape, clip, np.float32)
-    return np.where(labels > 0, np.minimum(far + 0.5, clip) / clip, 0.0).astype(np.float32)
+    far = np.minimum(far + 0.5, clip)
+    known = np.maximum(labels, 0)
+    greatest = np.zeros(int(known.max(initial=0)) + 1, np.float32)
+    np.maximum.at(greatest, known.ravel(), far.ravel())
+    return np.where(labels > 0, far / np.maximum(greatest, 0.5)[known], 0.0).astype(np.float32)
+
+
+def surface(kinds: np.ndarray, count: int) -> np.ndarray:
+    """Share of each of `count` kinds of surface in cells of HEIGHT_STRIDE px, float32 (count, h/4, w/4); zero where unknown."""
+    rows, cols = (n // HEIGHT_STRIDE for n in kinds.shape)
+    cells = kinds.reshape(rows, HEIGHT_STRIDE, cols, HEIGHT_STRIDE)
+    shares = np.stack([(cells == kind).mean((1, 3)) for kind in range(count)]).astype(np.float32)
+    shares[:, (cells == IGNORED).any((1, 3))] = 0
+    return shares
+
+
+def slope(labels: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Rise of each section's plane per px of column and row (m/px, image frame) at the cells' middles, float32 (2, h/4, w/4).
+
+    Planes are fitted by least squares to the `height` (h, w) of each section's pixels; NaN off sections and where heights
+    are unknown.
+    """
+    known = np.where(np.isfinite(height), np.maximum(labels, 0), 0)
+    n = int(known.max(initial=0)) + 1
+    row, col = (a.ravel().astype(float) for a in np.mgrid[: labels.shape[0], : labels.shape[1]])
+    index, h = known.ravel(), np.nan_to_num(height).ravel().astype(float)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.bincount(index, values, n) / np.maximum(np.bincount(index, minlength=n), 1)
+
+    c, r, z = col - mean(col)[index], row - mean(row)[index], h - mean(h)[index]
+    cc, rr, cr, cz, rz = mean(c * c), mean(r * r), mean(c * r), mean(c * z), mean(r * z)
+    determinant = cc * rr - cr**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = np.stack([rr * cz - cr * rz, cc * rz - cr * cz]) / determinant
+    plane[:, (determinant < 0.05) | (np.arange(n) == 0)] = np.nan
+    middle = known[HEIGHT_STRIDE // 2 :: HEIGHT_STRIDE, HEIGHT_STRIDE // 2 :: HEIGHT_STRIDE]
+    return plane[:, middle].astype(np.float32)
 
 
 def edge(labels: np.ndarray) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""Training one dense network within a time budget, resumed where a kill left it.
+"""Training the dense network within a time budget, resumed where a kill left it.
+
+One network learns sections, corners and heights at once. Part of its tiles are blended with sections as a model might find them:
+so the same weights serve as 2D model on the image and as 3D model on the blended one (`learn.export`).
 
 In: a data folder (`roofgraph/`, `chips/`), and a pool of simulated tiles which a background process fills. Out, below `--out`:
 `checkpoint.pt` (weights, their running mean, optimiser, steps and seconds used; written whole every few minutes) and
@@ -25,12 +28,13 @@ from torch.utils.data import DataLoader, Dataset
 from kibs_steps import cli, store
 from kibs_steps.blend import blend
 from kibs_steps.learn import dataset, targets
-from kibs_steps.learn.architectures import Dense, normalised
+from kibs_steps.learn.architectures import SURFACES, Dense, normalised
 from kibs_steps.models.contract import ContractMismatch
 
 DISTANCE_CLIP = 5.0  # px
 BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
-SHARES = {"sections": (0.6, 0.2, 0.2), "corners": (0.75, 0.25, 0.0)}  # simulated, pasted houses, chips
+SHARES = (0.62, 0.23, 0.15)  # simulated, pasted houses, chips
+BLENDED = 0.4  # share of tiles that are shown blended
 EDGES, CENTRES = targets.height_bins()
 
 Batch = dict[str, torch.Tensor]
@@ -39,7 +43,6 @@ Batch = dict[str, torch.Tensor]
 class Settings(NamedTuple):
     """What a run is: stored with its checkpoint."""
 
-    task: str
     seed: int
     size: int = 192
     batch: int = 8
@@ -48,17 +51,15 @@ class Settings(NamedTuple):
 
 
 class Examples(Dataset):
-    """Tiles of a mixture with the targets of one task, as arrays a DataLoader can stack."""
+    """Tiles of a mixture with their targets, as arrays a DataLoader can stack."""
 
-    def __init__(self, mixture: dataset.Mixture, task: str):
-        self.mixture, self.task = mixture, task
+    def __init__(self, mixture: dataset.Mixture):
+        self.mixture = mixture
 
     def __getitem__(self, index: int) -> dict[str, np.ndarray]:
         cv2.setNumThreads(1)
-        sample = self.mixture[index]
-        if self.task == "sections":
-            return section_example(sample)
-        return corner_example(sample, np.random.default_rng([self.mixture.seed, index, 1]))
+        rng = np.random.default_rng([self.mixture.seed, index, 1])
+        return example(self.mixture[index], rng, bool(rng.random() < BLENDED))
 
 
 class Onwards(torch.utils.data.Sampler):
@@ -71,40 +72,43 @@ class Onwards(torch.utils.data.Sampler):
         return iter(range(self.start, 2**31))
 
 
-def section_example(sample: dataset.Sample) -> dict[str, np.ndarray]:
-    """Image, geometry and the targets of the sections task."""
+def example(sample: dataset.Sample, rng: np.random.Generator, blended: bool) -> dict[str, np.ndarray]:
+    """Image, plain or blended with sections as a model might find them, geometry and all targets.
+
+    A blended image shows the sections: what it is asked for is corners and heights.
+    """
+    size = sample.labels.shape
+    plain = np.float32(not blended)
     return {
-        "image": sample.rgb.transpose(2, 0, 1).copy(),
+        "image": (painted(sample, rng) if blended else sample.rgb).transpose(2, 0, 1).copy(),
         "geometry": sample.geometry,
-        "roof": sample.roof,
+        "roof": np.where(blended, np.uint8(targets.IGNORED), sample.roof),
         "edge": targets.edge(sample.labels),
         "distance": targets.distance(sample.labels, DISTANCE_CLIP),
-        "known": (sample.labels >= 0).astype(np.float32) * targets.section_weight(sample.labels),
-    }
-
-
-def corner_example(sample: dataset.Sample, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Blended image (of sections as a model might find them), geometry and the targets of the corners task."""
-    labels = np.maximum(sample.labels, 0)
-    areas = ndimage.label((sample.labels < 0) & (sample.roof == 1))[0]
-    labels = np.where(areas > 0, areas + labels.max(), labels).astype(np.int32)
-    if rng.random() < 0.85:
-        labels = targets.perturbed(labels, rng)
-    size = labels.shape
-    return {
-        "image": blend(sample.rgb, labels, **BLEND).transpose(2, 0, 1).copy(),
-        "geometry": sample.geometry,
+        "sections_known": plain * (sample.labels >= 0).astype(np.float32) * targets.section_weight(sample.labels),
         "heat": targets.corner_heat(sample.corners, size),
         "offset": targets.corner_offset(sample.corners, size),
-        "known": sample.corners_known,
+        "corners_known": sample.corners_known,
+        "surface": targets.surface(sample.surface, SURFACES),
+        "slope": targets.slope(sample.labels, sample.height),
         "corner_height": targets.corner_height(sample.corners, sample.corner_heights, size),
         "roof_height": targets.roof_height(sample.height),
     }
 
 
+def painted(sample: dataset.Sample, rng: np.random.Generator) -> np.ndarray:
+    """The image (s, s, 3) uint8 blended with sections, mostly wrong in the ways models are wrong."""
+    labels = np.maximum(sample.labels, 0)
+    areas = ndimage.label((sample.labels < 0) & (sample.roof == 1))[0]
+    labels = np.where(areas > 0, areas + labels.max(), labels).astype(np.int32)
+    if rng.random() < 0.85:
+        labels = targets.perturbed(labels, rng)
+    return blend(sample.rgb, labels, **BLEND)
+
+
 def section_losses(raw: Batch, batch: Batch) -> Batch:
-    """Loss terms of the sections task from logits; pixels without truth do not count."""
-    roof, known = batch["roof"], batch["known"]
+    """Loss terms of sections from logits; pixels without truth do not count."""
+    roof, known = batch["roof"], batch["sections_known"]
     judged = (roof != targets.IGNORED).float()
     truth = (roof == 1).float()
     logit = raw["roof"][:, 0]
@@ -128,8 +132,8 @@ def section_losses(raw: Batch, batch: Batch) -> Batch:
 
 
 def corner_losses(raw: Batch, batch: Batch) -> Batch:
-    """Loss terms of the corners task: focal heatmap and L1 offset (CenterNet), soft cross-entropy of heights."""
-    heat, known = batch["heat"], batch["known"].float()
+    """Loss terms of corners: focal heatmap and L1 offset (CenterNet, Zhou et al. 2019)."""
+    heat, known = batch["heat"], batch["corners_known"].float()
     logit = raw["corner"][:, 0]
     probability = torch.sigmoid(logit).clamp(1e-4, 1 - 1e-4)
     peak = (heat == 1).float() * known
@@ -138,37 +142,50 @@ def corner_losses(raw: Batch, batch: Batch) -> Batch:
     at_corner = torch.isfinite(batch["offset"])
     offset = 0.5 * torch.tanh(raw["offset"])
     offset_error = (offset - torch.nan_to_num(batch["offset"])).abs() * at_corner
+    return {
+        "corner": 0.4 * (hit + miss).sum() / peak.sum().clamp(min=1),
+        "offset": offset_error.sum() / at_corner.sum().clamp(min=1),
+    }
+
+
+def height_losses(raw: Batch, batch: Batch) -> Batch:
+    """Loss terms of what heights follow from: kinds of surface, heights (their distribution and its mean), slopes."""
     log_height = F.log_softmax(raw["height"], dim=1)
+    centres = torch.from_numpy(CENTRES).float()
 
     def height_loss(height: torch.Tensor) -> torch.Tensor:
         cells = torch.isfinite(height).nonzero(as_tuple=True)
         soft = targets.height_distribution(height[cells].numpy().astype(np.float64), EDGES, CENTRES)
         chosen = log_height.permute(0, 2, 3, 1)[cells]
-        return -(torch.from_numpy(soft) * chosen).sum() / max(len(cells[0]), 1)
+        off = F.smooth_l1_loss(chosen.exp() @ centres, height[cells], reduction="sum", beta=1.0)
+        return (0.2 * off - (torch.from_numpy(soft) * chosen).sum()) / max(len(cells[0]), 1)
 
+    share = batch["surface"]
+    known = share.sum(1) > 0
+    surface = -(share * F.log_softmax(raw["surface"], dim=1)).sum(1)
+    sloped = torch.isfinite(batch["slope"])
+    slope_error = (raw["slope"] - torch.nan_to_num(batch["slope"]).clamp(-1.5, 1.5)).abs() * sloped
     return {
-        "corner": (hit + miss).sum() / peak.sum().clamp(min=1),
-        "offset": offset_error.sum() / at_corner.sum().clamp(min=1),
-        "height": 0.5 * height_loss(batch["corner_height"]),
-        "roof_height": 0.5 * height_loss(batch["roof_height"]),
+        "surface": surface.sum() / known.sum().clamp(min=1),
+        "height": 0.4 * height_loss(batch["corner_height"]),
+        "roof_height": 0.6 * height_loss(batch["roof_height"]),
+        "slope": 3 * slope_error.sum() / sloped.sum().clamp(min=1),
     }
 
 
-LOSSES = {"sections": section_losses, "corners": corner_losses}
+def losses(raw: Batch, batch: Batch) -> Batch:
+    """All loss terms."""
+    return {**section_losses(raw, batch), **corner_losses(raw, batch), **height_losses(raw, batch)}
 
 
-def network(task: str) -> Dense:
-    """A new network of a task."""
-    return Dense(task, bins=len(CENTRES) if task == "corners" else 0)
+def network(task: str = "both") -> Dense:
+    """A new network that gives the maps of a task."""
+    return Dense(len(CENTRES), task)
 
 
-def start_from(model: Dense, checkpoint: str | Path) -> int:
-    """Fills a network with the averaged weights of another run, but for the heads of another task; returns how many tensors."""
-    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
-    heads = () if state["settings"]["task"] == model.task else ("maps.", "height.")
-    fitting = {name: value for name, value in state["average"].items() if not name.startswith(heads)}
-    model.load_state_dict(fitting, strict=False)
-    return len(fitting)
+def start_from(model: Dense, checkpoint: str | Path) -> None:
+    """Fills a network with the averaged weights of another run."""
+    model.load_state_dict(torch.load(checkpoint, weights_only=True, map_location="cpu")["average"])
 
 
 def learning_rate(used: float, top: float) -> float:
@@ -219,6 +236,7 @@ def train(
     from torch.utils.tensorboard import SummaryWriter
 
     path = out / "checkpoint.pt"
+    fast_bfloat16 = torch.cpu._is_avx512_bf16_supported()  # elsewhere bfloat16 is several times slower than float32
     torch.manual_seed(settings.seed)
     model = model.to(memory_format=torch.channels_last).train()
     optimiser = torch.optim.AdamW(model.parameters(), lr=settings.rate, weight_decay=settings.decay, fused=True)
@@ -248,9 +266,9 @@ def train(
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(used / seconds, settings.rate)
         image = normalised(batch["image"]).contiguous(memory_format=torch.channels_last)
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bfloat16):
             raw = model.logits(image, batch["geometry"])
-        terms = LOSSES[settings.task]({k: v.float() for k, v in raw.items()}, batch)
+        terms = losses({k: v.float() for k, v in raw.items()}, batch)
         loss = sum(terms.values())
         optimiser.zero_grad()
         loss.backward()
@@ -289,9 +307,8 @@ def fill_pool(pool: Path, count: int, seed: int, chips: list[dataset.Chip]) -> N
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Train the network of one task on simulated and real tiles."""
+    """Train the network on simulated and real tiles."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.training", description=main.__doc__)
-    parser.add_argument("--task", choices=sorted(LOSSES), required=True)
     parser.add_argument("--data", required=True, help="data folder with roofgraph/roofgraph.tar and chips/")
     parser.add_argument("--out", required=True, help="folder of this run")
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
@@ -313,15 +330,15 @@ def main(argv: list[str] | None = None) -> None:
             target=fill_pool, args=(pool, args.tiles, args.seed, chips), daemon=True
         )
         renderer.start()
-    settings = Settings(args.task, args.seed, rate=args.rate)
-    model = network(args.task)
+    settings = Settings(args.seed, rate=args.rate)
+    model = network()
     if args.init:
-        print(f"{start_from(model, args.init)} tensors from {args.init}")
+        start_from(model, args.init)
     else:
         model.encoder.load_imagenet()
     training = [graph for graph in graphs if not dataset.held_out(graph)]
-    mixture = dataset.Mixture(pool, training, chips, SHARES[args.task], settings.size, args.seed)
-    steps = train(model, Examples(mixture, args.task), settings, out, args.minutes * 60)
+    mixture = dataset.Mixture(pool, training, chips, SHARES, settings.size, args.seed)
+    steps = train(model, Examples(mixture), settings, out, args.minutes * 60)
     print(f"{out / 'checkpoint.pt'}: {steps} steps")
 
 

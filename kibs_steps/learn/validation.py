@@ -177,16 +177,16 @@ def judge_sections(
 def best_thresholds(
     raw: Sequence[dict[str, np.ndarray]], samples: Sequence[dataset.Sample], contract: dict[str, Any]
 ) -> dict[str, float]:
-    """The pair of `roof` and `marker` thresholds with the best AP at overlap 0.5 over the samples, by trying a grid."""
+    """The pair of `roof` and `prominence` thresholds with the best AP at overlap 0.5 over the samples, by trying a grid."""
 
-    def score(roof: float, marker: float) -> float:
-        tried = {**contract, "thresholds": {**contract["thresholds"], "roof": roof, "marker": marker}}
+    def score(roof: float, prominence: float) -> float:
+        tried = {**contract, "thresholds": {**contract["thresholds"], "roof": roof, "prominence": prominence}}
         found = [heads.decode_sections(maps, tried) for maps in raw]
         return average_precision(matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True))
 
-    grid = [(roof, marker) for roof in (0.35, 0.45, 0.55) for marker in (0.35, 0.45, 0.55, 0.65, 0.75)]
-    roof, marker = max(grid, key=lambda pair: score(*pair))
-    return {"roof": roof, "marker": marker}
+    grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)]
+    roof, prominence = max(grid, key=lambda pair: score(*pair))
+    return {"roof": roof, "prominence": prominence}
 
 
 def judge_corners(
@@ -251,7 +251,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=12, help="simulated and pasted scenes each")
     parser.add_argument("--out", required=True, help="report, JSON")
     parser.add_argument("--pictures", help="folder for one picture per test set")
-    parser.add_argument("--choose", action="store_true", help="first choose roof and marker thresholds on these sets")
+    parser.add_argument(
+        "--choose", action="store_true", help="first choose roof and prominence thresholds on these sets"
+    )
     args = parser.parse_args(argv)
     model = contracts.load(args.sections, "sections")
     corner_model = contracts.load(args.corners, "corners") if args.corners else None

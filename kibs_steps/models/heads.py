@@ -13,6 +13,9 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+PROMINENCE = 0.2  # of a section's summit, where the contract does not say
+SMOOTH = 0.5  # px: summits one pixel wide are noise
+
 
 class Sections(NamedTuple):
     """Label image (s, s) int32 with labels 1…n, and scores (n,) in 0–1."""
@@ -48,24 +51,62 @@ def decode_corners(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> 
 
 
 def dense_sections(roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, thresholds: dict[str, float]) -> Sections:
-    """Markers where the distance to the rim is large, flooded over the roof (watershed).
+    """Sections where the distance to the rim rises to a summit of its own, flooded over the roof (watershed).
 
-    `roof`, `edge`, `distance` are (s, s) in 0–1. A roof area without a marker is one section of its own. Sections under
-    `min_area` px are given to the neighbour they touch most, or dropped when alone.
+    `roof`, `edge`, `distance` are (s, s) in 0–1. Of all summits of distance − edge those count that rise `prominence` above
+    the pass to a higher one. Every roof area is at least one section. Sections under `min_area` px are given to the neighbour
+    they touch most, or dropped when alone.
     """
     mask = roof > thresholds["roof"]
     if not mask.any():
         return Sections(np.zeros(roof.shape, np.int32), np.zeros(0, np.float32))
-    markers, n = ndimage.label(mask & (distance > thresholds["marker"]))
-    areas, n_areas = ndimage.label(mask)
-    # Areas without any marker are too thin to have one: the area itself is the marker.
-    marked = np.zeros(n_areas + 1, bool)
-    marked[areas[markers > 0]] = True
-    lonely = mask & ~marked[areas]
-    markers[lonely] = areas[lonely] + n
-    labels = flood(markers, mask, distance - edge)
+    level = ndimage.gaussian_filter((distance - edge).astype(np.float32), SMOOTH)
+    basins = flood(summits(level, mask), mask, level)
+    labels = joined_basins(basins, level, thresholds.get("prominence", PROMINENCE))
     labels = absorb_small(labels, int(thresholds["min_area"]))
     return Sections(labels, mean_by_label(roof, labels))
+
+
+def summits(level: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Local maxima of `level` (s, s) among 8 neighbours of the mask, plateaus as one, labelled 1…n: one or more an area."""
+    inside = np.where(mask, level, -np.inf)
+    return ndimage.label(mask & (inside >= ndimage.maximum_filter(inside, size=3)), np.ones((3, 3)))[0]
+
+
+def joined_basins(basins: np.ndarray, level: np.ndarray, prominence: float) -> np.ndarray:
+    """Watershed basins 1…n (s, s) joined across every pass that lies less than `prominence` below the lower of two summits.
+
+    Passes are taken from the highest down, so a summit's prominence is that of topography: its rise above the highest pass
+    that leads to a higher summit.
+    """
+    n = int(basins.max(initial=0))
+    summit = np.full(n + 1, -np.inf)
+    np.maximum.at(summit, basins.ravel(), level.ravel())
+    passes = []
+    for a, b in (
+        ((slice(1, None),), (slice(None, -1),)),
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+    ):
+        differ = (basins[a] != basins[b]) & (basins[a] > 0) & (basins[b] > 0)
+        pair = np.sort(np.stack([basins[a][differ], basins[b][differ]], 1), axis=1)
+        passes.append(np.column_stack([pair, np.minimum(level[a][differ], level[b][differ])]))
+    passes = np.concatenate(passes)
+    passes = passes[np.lexsort((passes[:, 1], passes[:, 0], -passes[:, 2]))]
+    parent = np.arange(n + 1)
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return int(i)
+
+    for first, second, height in passes:
+        a, b = root(int(first)), root(int(second))
+        if a != b:
+            low, high = (a, b) if (summit[a], -a) < (summit[b], -b) else (b, a)
+            if summit[low] - height < prominence:
+                parent[low] = high
+    return np.array([root(i) for i in range(n + 1)], np.int32)[basins]
 
 
 def flood(markers: np.ndarray, mask: np.ndarray, level: np.ndarray) -> np.ndarray:

@@ -36,7 +36,8 @@ def geometry_vector(view: tuple[float, float] | None, sun: tuple[float, float] |
 def open_network(model: contracts.Model, geometry: np.ndarray, threads: int = 1) -> Network:
     """A function from an image (s, s, 3) uint8 to the model's named outputs without their batch axis.
 
-    Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged.
+    Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged; those
+    that want tiles `upright` see the one view in which roofs lean up.
     `geometry` (1, 6) goes to models whose contract asks for it. CPU provider; `threads` intra-op threads.
     """
     import onnxruntime as ort
@@ -57,7 +58,11 @@ def open_network(model: contracts.Model, geometry: np.ndarray, threads: int = 1)
         outputs = session.run(names, feed)
         return {name: (value[0] if dense else value) for name, value in zip(names, outputs, strict=True)}
 
-    views = [Flip(bool(i & 4), bool(i & 1), bool(i & 2)) for i in range(model.contract.get("flips", 1) if dense else 1)]
+    views = (
+        [upright(geometry)]
+        if model.contract.get("upright")
+        else FLIPS[: model.contract.get("flips", 1) if dense else 1]
+    )
 
     def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
         total: dict[str, np.ndarray] = {}
@@ -102,6 +107,22 @@ class Flip(NamedTuple):
                 value = value[::-1] if name == "offset" else value
             out[name] = np.ascontiguousarray(value)
         return out
+
+
+FLIPS = [Flip(bool(i & 4), bool(i & 1), bool(i & 2)) for i in range(8)]
+
+
+def leans_up(col: float, row: float) -> bool:
+    """Whether a lean (px per metre) points up in the image, less left than up and not right: one octant of eight."""
+    return bool(row <= 0 and 0 <= -col <= -row)
+
+
+def upright(geometry: np.ndarray) -> Flip:
+    """The symmetry in which roofs lean up (`leans_up`), so that a network need learn one octant of views, not eight.
+
+    Where the view's lean is zero or unknown the tile stays as it is.
+    """
+    return next((flip for flip in FLIPS if leans_up(*flip.geometry(geometry)[0, :2])), FLIPS[0])
 
 
 def from_record(path: str | Path, task: str) -> contracts.Model:

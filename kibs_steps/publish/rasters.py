@@ -99,7 +99,9 @@ def shown(sections: Sections, scene: Scene, window: Window) -> tuple[NDArray[np.
 
 
 @contextlib.contextmanager
-def cloud_optimized(path: str | Path, grid: Grid, dtype: str, nodata: float, tags: dict[str, str]) -> Iterator:
+def cloud_optimized(
+    path: str | Path, grid: Grid, dtype: str, nodata: float | None, tags: dict[str, str], bands: int = 1
+) -> Iterator:
     """A raster on a grid, open for writing by window; a COG under its name once the block ends without error.
 
     Overviews are decimated, not averaged: a label or the height of one roof stays what it is.
@@ -114,7 +116,7 @@ def cloud_optimized(path: str | Path, grid: Grid, dtype: str, nodata: float, tag
         "predictor": 3 if dtype.startswith("float") else 2,
         "bigtiff": "if_safer",
     }
-    size = {"width": grid.width, "height": grid.height, "count": 1}
+    size = {"width": grid.width, "height": grid.height, "count": bands}
     place = {"crs": grid.crs, "transform": grid.transform}
     with tempfile.TemporaryDirectory(prefix=".tmp-", dir=path.parent) as folder:
         plain = Path(folder) / "plain.tif"

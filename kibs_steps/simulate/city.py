@@ -59,6 +59,14 @@ def procedural(
     site = Site(rng, terrain, kit, area, float(curved))
     whole = np.array(roofs.rectangle(area[0] - 50, area[1] - 50, area[2] + 50, area[3] + 50))
     site.paint(whole, pick(rng, ["lawn", "rough", "soil", "pavement"]))
+    lay_out(site, style)
+    return City(site.faces, site.paints, kit.materials)
+
+
+def lay_out(site: Site, style: str) -> None:
+    """Streets over a site's whole area and what fills the blocks between them, where nothing stands yet."""
+    rng = site.rng
+    width, height = site.area[2] - site.area[0], site.area[3] - site.area[1]
     reach = np.hypot(width, height) / 2 + 30
     long0, long1, deep0, deep1, road0, road1 = BLOCKS[style]
 
@@ -91,4 +99,3 @@ def procedural(
             blocks.FILL["park" if rng.random() < green else name](site, s0, t0, s1, t1)
             if rng.random() < decoys:
                 blocks.add_decoys(site, s0, t0, s1, t1)
-    return City(site.faces, site.paints, kit.materials)

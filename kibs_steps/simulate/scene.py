@@ -11,6 +11,7 @@ Run as a program it writes one scene: `scene.tif`, `dtm.tif`, `truth.gpkg`, `ang
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,9 +23,10 @@ from kibs_steps import view as geometry
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction, convergence
-from kibs_steps.simulate import camera, light
+from kibs_steps.simulate import camera, citymodel, light, real
 from kibs_steps.simulate.city import MIXTURES, STYLES, procedural
-from kibs_steps.simulate.site import CLUTTER, ROOF, WALL, City
+from kibs_steps.simulate.citymodel import CityModel
+from kibs_steps.simulate.site import CLUTTER, ROOF, WALL, City, pick
 from kibs_steps.terrain import Terrain, flat
 
 STRIP = 256  # rows shaded at a time
@@ -316,7 +318,7 @@ def _photograph(
 
 def _truth(city: City, terrain: Terrain, grid: Grid, k: tuple[float, float], seen: np.ndarray) -> list[SectionTruth]:
     counts = np.bincount(seen.ravel())
-    roofs = [f for f in city.faces if f.kind == ROOF]
+    roofs = [f for f in city.faces if f.kind == ROOF and f.section]
     if not roofs:
         return []
     rings = [ring for f in roofs for ring in (f.ring, *f.holes)]
@@ -422,8 +424,14 @@ def random_scene(
     sun_elevation: tuple[float, float] = (20, 70),
     backgrounds: list[tuple[np.ndarray, np.ndarray]] | None = None,
     style: str | None = None,
+    cities: Sequence[CityModel] = (),
+    city_share: float = 0.3,
 ) -> tuple[Rendering, np.ndarray]:
-    """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md)."""
+    """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md).
+
+    `city_share` of the tiles show a part of one of the real `cities`, if there are any; the others are procedural, of one `style`
+    or of any.
+    """
     side = size * gsd
     grid = Grid("", 0.0, side, gsd, size, size)
     view = _direction(*_random_view(rng, *view_elevation))
@@ -437,10 +445,17 @@ def random_scene(
         low, high = -margin - 60, side + margin + 60
         terrain = relief(rng, (low, low, high, high), 2.0, rng.uniform(0, 6), rng.uniform(0, 0.15))
     wide = side + 2 * margin
-    city = procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+    model = pick(rng, cities) if len(cities) and rng.random() < city_share else None
+
+    def build() -> City:
+        if model:
+            return real.city(rng, model, (-margin, -margin, wide - margin, wide - margin), terrain)
+        return procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+
+    city = build()
     # Tiles with hardly a roof teach little: most of them are drawn again.
     while _roofs_within(city, side) < 4 and rng.random() < 0.75:
-        city = procedural(rng, wide, wide, terrain, style, (-margin, -margin))
+        city = build()
     picture = render(city, terrain, grid, view, sun, rng, backgrounds if rng.random() < 0.5 else None)
     return picture, geometry_vector(view, sun, gsd)
 
@@ -454,15 +469,22 @@ def simulate(
     amplitude: float = 0.0,
     slope: float = 0.0,
     base: float = 100.0,
+    model: CityModel | None = None,
 ) -> tuple[Rendering, Terrain]:
     """One scene over `grid`: its rendering and its terrain (2 m posting, 250 m beyond the grid).
 
-    `amplitude` (m) and `slope` (m/m) shape the terrain, `base` (m) is its mean height.
+    `amplitude` (m) and `slope` (m/m) shape the terrain, `base` (m) is its mean height. With a `model` the scene shows that
+    city where it stands, on its own terrain.
     """
     rng = np.random.default_rng(seed)
     left, bottom, right, top = grid.bounds
-    terrain = relief(rng, (left - 250, bottom - 250, right + 250, top + 250), 2.0, amplitude, slope, base)
+    around = (left - 250, bottom - 250, right + 250, top + 250)
     margin = 60.0
+    if model:
+        terrain = real.surveyed_terrain(model, around, 2.0)
+        within = (left - margin, bottom - margin, right + margin, top + margin)
+        return render(real.as_surveyed(rng, model, within, terrain), terrain, grid, view, sun, rng), terrain
+    terrain = relief(rng, around, 2.0, amplitude, slope, base)
     city = procedural(
         rng, right - left + 2 * margin, top - bottom + 2 * margin, terrain, style, (left - margin, bottom - margin)
     )
@@ -536,8 +558,9 @@ def _write_raster(path: Path, values: np.ndarray, crs: str, x0: float, y0: float
         target.write(bands)
 
 
-def _origin(crs: str, gsd: float) -> tuple[float, float]:
-    """An upper-left corner near the centre of a CRS's area of use, on a multiple of the GSD (millimetres kept)."""
+def _origin(crs: str, gsd: float, size: int, model: CityModel | None) -> tuple[float, float]:
+    """An upper-left corner on a multiple of the GSD (millimetres kept): near the centre of the CRS's area of use, or so that
+    the middle of the city model's buildings is in the middle."""
     import pyproj
 
     try:
@@ -548,6 +571,9 @@ def _origin(crs: str, gsd: float) -> tuple[float, float]:
         ) from error
     if not system.is_projected or abs(system.axis_info[0].unit_conversion_factor - 1) > 1e-9:
         raise UnusableScene(f"--crs {crs} is not projected in metres: give a UTM zone, such as EPSG:32631")
+    if model:
+        x, y = np.median([b.centre for b in model.buildings], axis=0) + size * gsd / 2 * np.array([-1.0, 1.0])
+        return round(round(x / gsd) * gsd, 3), round(round(y / gsd) * gsd, 3)
     west, south, east, north = system.area_of_use.bounds if system.area_of_use else (2.0, 48.0, 4.0, 50.0)
     latitude = 49.2 if south < 49.2 < north else (south + north) / 2
     x, y = pyproj.Transformer.from_crs(system.geodetic_crs, system, always_xy=True).transform(
@@ -573,7 +599,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--style", choices=[*STYLES, *MIXTURES], default="mixed")
     parser.add_argument("--relief", type=float, default=0.0, help="amplitude of the terrain's waves in metres")
     parser.add_argument("--slope", type=float, default=0.0, help="slope of the terrain in percent")
-    parser.add_argument("--crs", default="EPSG:32631", help="a projected CRS in metres")
+    parser.add_argument(
+        "--city", type=Path, help="a CityJSON or CityJSONSeq file to show, where it stands, on its own ground"
+    )
+    parser.add_argument("--crs", default="EPSG:32631", help="a projected CRS in metres; a city file's own comes first")
     parser.add_argument("--out", type=Path, required=True, help="folder to write to")
     args = parser.parse_args(argv)
     if args.size < 1 or not args.gsd > 0:
@@ -581,17 +610,19 @@ def main(argv: list[str] | None = None) -> None:
     for name, least in (("view", 20), ("sun", 5)):
         if not least <= getattr(args, f"{name}_elevation") <= 90:
             raise UnusableScene(f"--{name}-elevation must be between {least} and 90 degrees")
-    grid = Grid(args.crs, *_origin(args.crs, args.gsd), args.gsd, args.size, args.size)
+    model = citymodel.read(args.city) if args.city else None
+    crs = model.crs if model and model.crs else args.crs
+    grid = Grid(crs, *_origin(crs, args.gsd, args.size, model), args.gsd, args.size, args.size)
     turned = convergence(grid)
     view = _direction(args.view_azimuth, args.view_elevation, turned)
     sun = _direction(args.sun_azimuth, args.sun_elevation, turned)
-    picture, terrain = simulate(args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0)
+    picture, terrain = simulate(args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0, model=model)
     step = terrain.step[0]
-    _write_raster(args.out / "scene.tif", picture.rgb, args.crs, grid.x0, grid.y0, grid.gsd)
+    _write_raster(args.out / "scene.tif", picture.rgb, crs, grid.x0, grid.y0, grid.gsd)
     _write_raster(
         args.out / "dtm.tif",
         terrain.heights.astype(np.float32),
-        args.crs,
+        crs,
         terrain.x0 - step / 2,
         terrain.y0 + step / 2,
         step,

@@ -166,9 +166,9 @@ class Site:
 
     def grounded(self, place: Place, ring: np.ndarray) -> Place:
         """The place with its base at the lowest terrain under a footprint (n, ≥ 2, own frame)."""
-        return place._replace(base=self._ground_under(place, ring)[0])
+        return place._replace(base=self.ground_under(place, ring)[0])
 
-    def _ground_under(self, place: Place, ring: np.ndarray) -> tuple[float, float]:
+    def ground_under(self, place: Place, ring: np.ndarray) -> tuple[float, float]:
         """Lowest and highest terrain under a footprint."""
         if self.level:
             return self.ground, self.ground
@@ -198,7 +198,7 @@ class Site:
         ring += [(s1 + (s0 - s1) * i, t1) for i in shares] + [(s0, t1 + (t0 - t1) * i) for i in shares]
         self.paint(np.array([self.at(s, t) for s, t in ring]), use, tint)
 
-    def _cells(self, place: Place, ring: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray] | None:
+    def cells(self, place: Place, ring: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray] | None:
         """The part of the raster under a ring, and the ring's mask in it; None outside."""
         x_y = (place.put(ring) - [self.area[0], self.area[1]]) / CELL + 60
         col, row = np.maximum(x_y.min(0).astype(int), 0).tolist()
@@ -215,7 +215,7 @@ class Site:
         for ring in rings:
             middle = ring.mean(0)
             size = np.ptp(ring, axis=0)
-            found = self._cells(place, middle + (ring - middle) * np.maximum(1 - 1.4 / size, 0.2))
+            found = self.cells(place, middle + (ring - middle) * np.maximum(1 - 1.4 / size, 0.2))
             if found and (self.taken[found[0]] & found[1]).any():
                 return False
         return True
@@ -223,7 +223,7 @@ class Site:
     def occupy(self, place: Place, rings: list[np.ndarray]) -> None:
         """Mark the ground under rings (n, 2, own frame) as built on."""
         for ring in rings:
-            found = self._cells(place, ring)
+            found = self.cells(place, ring)
             if found:
                 self.taken[found[0]] |= found[1]
 
@@ -256,7 +256,7 @@ class Site:
             return 0
         self.occupy(place, footprints)
         rings = roofs.sections(wings)
-        low, high = self._ground_under(place, np.concatenate(rings))
+        low, high = self.ground_under(place, np.concatenate(rings))
         place = place._replace(base=low)
         # On a slope the eaves stay clear of the ground uphill.
         clear = high - low + 1.8 - min(float(ring[:, 2].min()) for ring in rings)
@@ -282,7 +282,7 @@ class Site:
             if parapet:
                 self._parapet(place, ring, parapet, number, wall, paint)
             if furnish:
-                self._furnish(place, ring, number, roof, tint, wall, paint)
+                self.furnish(place, ring, number, roof, tint, wall, paint)
         for quad in roofs.walls(rings, overhang):
             self.faces.append(Face(place.put(quad), (), WALL, 0, number, wall, paint))
         return number
@@ -336,7 +336,7 @@ class Site:
             quads.append([inner[j], inner[i], top_inner[i], top_inner[j]])
             self.faces += [Face(place.put(np.array(q)), (), CLUTTER, 0, number, cap, tint) for q in quads]
 
-    def _furnish(
+    def furnish(
         self,
         place: Place,
         ring: np.ndarray,
@@ -424,7 +424,9 @@ class Site:
         low: float = 0.0,
         tint: float = 0.1,
     ) -> None:
-        """An upright prism on the ground that is no building."""
+        """An upright prism on the ground that is no building; none where a building stands."""
+        if self.built(place.x, place.y):
+            return
         material = self.kit.draw(self.rng, use)
         place = self.grounded(place, ring)
         top, sides = roofs.prism(np.asarray(ring, float), low, height)

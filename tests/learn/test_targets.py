@@ -24,8 +24,30 @@ def test_distance_is_that_of_brute_force(labels):
     for row, col in np.argwhere(labels > 0):
         own = np.argwhere(rim & (labels == labels[row, col]))
         far = np.sqrt(((own - (row, col)) ** 2).sum(1).min())
-        expected[row, col] = min(far + 0.5, clip) / clip
+        expected[row, col] = min(far + 0.5, clip)
+    for label in (1, 2, 3):
+        expected[labels == label] /= expected[labels == label].max()
     np.testing.assert_allclose(targets.distance(labels, clip), expected, atol=1e-6)
+
+
+def test_surface_gives_the_shares_of_each_cell():
+    kinds = np.zeros((8, 8), np.uint8)
+    kinds[:4, :4], kinds[0, 0], kinds[4:, 4:] = 1, 2, targets.IGNORED
+    shares = targets.surface(kinds, 3)
+    np.testing.assert_allclose(shares[:, 0, 0], (0, 15 / 16, 1 / 16))
+    np.testing.assert_allclose(shares[:, 0, 1], (1, 0, 0))
+    assert not shares[:, 1, 1].any()
+
+
+def test_slope_is_that_of_each_plane():
+    labels = np.zeros((16, 24), np.int32)
+    labels[2:14, 2:12], labels[2:14, 12:22] = 1, 2
+    row, col = np.mgrid[:16, :24]
+    height = np.where(labels == 1, 3 + 0.25 * col - 0.1 * row, np.where(labels == 2, 9 - 0.5 * col, np.nan))
+    rise = targets.slope(labels, height.astype(np.float32))
+    np.testing.assert_allclose(rise[:, 1, 1], (0.25, -0.1), atol=1e-5)
+    np.testing.assert_allclose(rise[:, 1, 4], (-0.5, 0), atol=1e-5)
+    assert np.isnan(rise[:, 0, 5]).all()  # the middle of the last cells lies off the roof
 
 
 def test_edge_ignores_unknown_and_keeps_shared_rims(labels):

@@ -6,14 +6,14 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs the extra `learn` (torch)")
 
 from kibs_steps.learn import dataset, training  # noqa: E402
-from kibs_steps.learn.architectures import Dense  # noqa: E402
+from kibs_steps.learn.architectures import CHANNELS, Dense  # noqa: E402
 from kibs_steps.models.contract import ContractMismatch  # noqa: E402
 
 
 class Tiles(torch.utils.data.Dataset):
     """The same house everywhere."""
 
-    def __init__(self, task: str):
+    def __init__(self):
         sample = dataset.empty(np.full((64, 64, 3), 60, np.uint8))
         sample.rgb[20:40, 10:50] = 200
         sample.labels[20:40, 10:50] = 1
@@ -23,66 +23,85 @@ class Tiles(torch.utils.data.Dataset):
             corners=np.float32([[10, 20], [50, 20], [50, 40], [10, 40]]),
             corner_heights=np.float32([5, 5, 5, 5]),
         )
-        self.task, self.sample, self.seen = task, sample, []
+        self.sample, self.seen = sample, []
 
     def __getitem__(self, index):
         self.seen.append(index)
-        if self.task == "sections":
-            return training.section_example(self.sample)
-        return training.corner_example(self.sample, np.random.default_rng(index))
+        return training.example(self.sample, np.random.default_rng(index), blended=bool(index % 2))
 
 
-def settings(task: str) -> training.Settings:
-    return training.Settings(task, 0, size=64, batch=2)
+SETTINGS = training.Settings(0, size=64, batch=2)
 
 
-@pytest.mark.parametrize("task", ["sections", "corners"])
-def test_a_killed_run_goes_on_where_it_was(task, tmp_path):
-    tiles = Tiles(task)
-    assert training.train(training.network(task), tiles, settings(task), tmp_path, 600, steps=2, workers=0) == 2
+def test_a_killed_run_goes_on_where_it_was(tmp_path):
+    tiles = Tiles()
+    assert training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=2, workers=0) == 2
     first = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert first["step"] == 2
-    model = training.network(task)
-    assert training.train(model, tiles, settings(task), tmp_path, 600, steps=3, workers=0) == 3
+    model = training.network()
+    assert training.train(model, tiles, SETTINGS, tmp_path, 600, steps=3, workers=0) == 3
     second = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert second["step"] == 3
     assert second["seconds"] > first["seconds"]
     assert tiles.seen == list(range(6))  # no tile twice
-    assert training.train(model, tiles, settings(task), tmp_path, first["seconds"], workers=0) == 3  # budget used up
+    assert training.train(model, tiles, SETTINGS, tmp_path, first["seconds"], workers=0) == 3  # budget used up
 
 
 def test_another_run_is_not_overwritten(tmp_path):
-    tiles = Tiles("sections")
-    training.train(training.network("sections"), tiles, settings("sections"), tmp_path, 600, steps=1, workers=0)
-    other = settings("sections")._replace(seed=1)
+    tiles = Tiles()
+    training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=1, workers=0)
     with pytest.raises(ContractMismatch, match="another run"):
-        training.train(training.network("sections"), tiles, other, tmp_path, 600, steps=2, workers=0)
+        training.train(training.network(), tiles, SETTINGS._replace(seed=1), tmp_path, 600, steps=2, workers=0)
+
+
+def logits() -> dict[str, torch.Tensor]:
+    """Blank logits of a 64 px tile, by name, that ask for gradients."""
+    sides = {"surface": (5, 16), "height": (len(training.CENTRES), 16), "slope": (2, 16)}
+    sides |= {name: (channels, 64) for name, channels in CHANNELS.items()}
+    return {name: torch.zeros(1, c, side, side, requires_grad=True) for name, (c, side) in sides.items()}
+
+
+def batch_of(example: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {k: torch.as_tensor(v)[None] for k, v in example.items()}
 
 
 def test_unknown_ground_gives_no_gradient():
-    sample = Tiles("sections").sample
+    sample = Tiles().sample
     sample.labels[:, 32:] = -1
     sample.roof[:, 32:] = dataset.UNKNOWN
-    example = training.section_example(sample)
-    batch = {k: torch.as_tensor(v)[None] for k, v in example.items()}
-    raw = {name: torch.zeros(1, 1, 64, 64, requires_grad=True) for name in ("roof", "edge", "distance")}
-    sum(training.section_losses(raw, batch).values()).backward()
+    sample.corners_known[:, 32:] = 0
+    sample.height[:, 32:] = np.nan
+    sample = sample._replace(corners=sample.corners[::3], corner_heights=sample.corner_heights[::3])
+    sample.surface[:, :32] = 0
+    raw = logits()
+    sum(training.losses(raw, batch_of(training.example(sample, np.random.default_rng(0), False))).values()).backward()
     for name, value in raw.items():
-        assert not value.grad[..., 32:].any(), name
-        assert value.grad[..., :32].any(), name
+        half = value.shape[-1] // 2
+        assert not value.grad[..., half:].any(), name
+        assert value.grad[..., :half].any() or name == "slope", name
+
+
+def test_blended_tiles_teach_corners_and_heights_only():
+    raw = logits()
+    sum(
+        training.losses(raw, batch_of(training.example(Tiles().sample, np.random.default_rng(0), True))).values()
+    ).backward()
+    for name in ("roof", "edge", "distance"):
+        assert not raw[name].grad.any(), name
+    for name in ("corner", "offset", "height"):
+        assert raw[name].grad.any(), name
 
 
 def test_a_new_run_takes_over_the_weights_of_another(tmp_path):
-    training.train(training.network("sections"), Tiles("sections"), settings("sections"), tmp_path, 600, 1, 1, 0)
+    training.train(training.network(), Tiles(), SETTINGS, tmp_path, 600, steps=1, workers=0)
     model = training.network("corners")
-    taken = training.start_from(model, tmp_path / "checkpoint.pt")
+    training.start_from(model, tmp_path / "checkpoint.pt")
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["average"]
-    assert taken == len([k for k in state if not k.startswith("maps.")])
-    assert torch.equal(model.state_dict()["encoder._conv_stem.weight"], state["encoder._conv_stem.weight"])
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
 
 
 def test_geometry_changes_the_answer_once_learned():
-    model = Dense("corners", bins=4).eval()
+    model = Dense(4, "corners").eval()
     for part in model.modulation:
         torch.nn.init.normal_(part.linear.weight)
     image = torch.randn(1, 3, 64, 64)

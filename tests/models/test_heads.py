@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from kibs_steps.models import heads
 
-THRESHOLDS = {"roof": 0.5, "marker": 0.35, "min_area": 10, "corner": 0.3, "score": 0.5}
+THRESHOLDS = {"roof": 0.5, "prominence": 0.2, "min_area": 10, "corner": 0.3, "score": 0.5}
 HEIGHTS = {"edges": [0.0, 1.0, 2.0, 4.0], "centres": [0.5, 1.5, 3.0], "fallback": 2.0}
 
 
@@ -34,6 +34,25 @@ def test_adjacent_sections_come_back_apart():
         assert counts.max() == (labels == label).sum()
         assert (found.labels == values[np.argmax(counts)]).sum() == (labels == label).sum()
     np.testing.assert_allclose(found.scores, 1)
+
+
+def test_a_summit_counts_by_its_rise_above_the_pass():
+    """Two summits of 1 and 0.8 with a pass of 0.5 between them: two sections below a prominence of 0.3, one above it."""
+    level = np.full((3, 9), 0.5)
+    level[1, 2], level[1, 6] = 1.0, 0.8
+    mask = np.ones(level.shape, bool)
+    basins = heads.flood(heads.summits(level, mask & (level > 0.5)), mask, level)
+    assert len(np.unique(heads.joined_basins(basins, level, 0.25))) == 2
+    assert len(np.unique(heads.joined_basins(basins, level, 0.35))) == 1
+
+
+def test_joining_depends_on_the_highest_pass_only():
+    """Three summits in a row: the middle one joins across the higher pass, whatever labels the basins have."""
+    level = np.array([[1.0, 0.5, 0.7, 0.6, 0.9]])
+    for order in ((1, 2, 3), (3, 1, 2), (2, 3, 1)):
+        basins = np.array(order, np.int32)[[[0, 0, 1, 1, 2]]]
+        joined = heads.joined_basins(basins, level, 0.15)[0]
+        assert joined[2] == joined[4] != joined[0]
 
 
 def test_thin_roof_without_marker_is_a_section():

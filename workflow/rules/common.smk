@@ -2,6 +2,7 @@
 
 import atexit
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -16,30 +17,22 @@ TEMPORARY = ["blended.tif", "tiled.tif"]  # files that Snakemake deletes after u
 
 
 def planned():
-    """The plan of every scene to build, its inputs checked. A user's mistake ends the process with what to do about it."""
-    try:
-        if Path("config.yaml").is_file():
-            settings.read("config.yaml")
-        schema = settings.read(
-            Path(workflow.basedir, "workflow/schemas/config.schema.yaml")
-        )
-        user_inputs.writable(RESULTS)
-        found = {
-            name: plans.plan(name, values, Path(workflow.basedir), RESULTS)
-            for name, values in plans.scenes(config, schema).items()
-        }
-        if not workflow.remote_exec:
-            for p in found.values():
-                p.warnings.extend(user_inputs.check(p, RESULTS))
-        return found
-    except Exception as error:
-        text = cli.told(error)
-        if text is None:
-            raise
-        sys.exit(f"error: {text}")
+    """The plan of every scene to build, its inputs checked."""
+    user_inputs.writable(RESULTS)
+    schema = settings.read(
+        Path(workflow.basedir, "workflow/schemas/config.schema.yaml")
+    )
+    found = {
+        name: plans.plan(name, values, Path(workflow.basedir), RESULTS)
+        for name, values in plans.scenes(config, schema).items()
+    }
+    if not workflow.remote_exec:
+        for p in found.values():
+            p.warnings.extend(user_inputs.check(p, RESULTS))
+    return found
 
 
-PLANS = planned()
+PLANS = cli.or_exit(planned)
 
 
 PUBLISHED = [
@@ -143,9 +136,18 @@ def licensed(wildcards):
     return [f"results/{wildcards.scene}/models/{task}.json" for task in tasks]
 
 
+def using(method):
+    """A wildcard constraint: the names of the scenes made by a method, or nothing at all."""
+    names = [
+        re.escape(p.name) for p in PLANS.values() if p.settings["method"] == method
+    ]
+    return "|".join(names) or "(?!)"
+
+
 def published(p):
     """All published files of a scene."""
     names = PUBLISHED + (["evaluation.json"] if p.truth else [])
+    names += ["paper.tif"] if p.settings["mode"] == "paper" else []
     return [f"results/{p.name}/{f}" for f in names]
 
 

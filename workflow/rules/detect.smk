@@ -23,15 +23,19 @@ rule sections:
         seams="results/{scene}/blocks/{block}/detected/seams.npz",
     log:
         "results/{scene}/logs/sections/{block}.log",
+    wildcard_constraints:
+        scene=using("two_stage"),
     retries: 1
     conda:
         RUN
     params:
         signature=signature("sections"),
-        block=lambda w: plan(w).tiling.block,
+        tiling=lambda w: plan(w).tiling,
+        seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.sections --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --block {params.block} --labels {output.labels:q} --pieces {output.pieces:q}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} > {log:q} 2>&1"
 
 
@@ -54,10 +58,11 @@ rule blend:
         RUN
     params:
         signature=signature("blend"),
-        block=lambda w: plan(w).tiling.block,
+        tiling=lambda w: plan(w).tiling,
     shell:
         "python -m kibs_steps.blend --scene {input.scene:q} --tiles {input.tiles:q} --labels {input.labels:q}"
-        " --model {input.model:q} --name {wildcards.block} --block {params.block} --out {output:q} > {log:q} 2>&1"
+        " --model {input.model:q} --name {wildcards.block} --margin {params.tiling.margin}"
+        " --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs("corners", "results/{scene}/blocks/{block}/detected/corners.parquet")
@@ -73,15 +78,57 @@ rule corners:
         "results/{scene}/blocks/{block}/detected/corners.parquet",
     log:
         "results/{scene}/logs/corners/{block}.log",
+    wildcard_constraints:
+        scene=using("two_stage"),
     retries: 1
     conda:
         RUN
     params:
         signature=signature("corners"),
-        block=lambda w: plan(w).tiling.block,
+        tiling=lambda w: plan(w).tiling,
     shell:
         "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --model {input.model:q}"
-        " --name {wildcards.block} --block {params.block} --out {output:q} > {log:q} 2>&1"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
+
+
+given = inputs(
+    "single",
+    "results/{scene}/blocks/{block}/sections.tif",
+    "results/{scene}/blocks/{block}/detected/pieces.parquet",
+    "results/{scene}/blocks/{block}/detected/links.parquet",
+    "results/{scene}/blocks/{block}/detected/seams.npz",
+    "results/{scene}/blocks/{block}/detected/corners.parquet",
+)
+
+
+rule single:
+    """Find the roof sections and corners of one block with one model."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        tiles=given("results/{scene}/blocks/{block}/tiles.tif"),
+        model=given("results/{scene}/models/sections.json"),
+    output:
+        labels="results/{scene}/blocks/{block}/sections.tif",
+        pieces="results/{scene}/blocks/{block}/detected/pieces.parquet",
+        links="results/{scene}/blocks/{block}/detected/links.parquet",
+        seams="results/{scene}/blocks/{block}/detected/seams.npz",
+        corners="results/{scene}/blocks/{block}/detected/corners.parquet",
+    log:
+        "results/{scene}/logs/single/{block}.log",
+    wildcard_constraints:
+        scene=using("single"),
+    retries: 1
+    conda:
+        RUN
+    params:
+        signature=signature("single"),
+        tiling=lambda w: plan(w).tiling,
+        seams=lambda w: plan(w).seam_rule,
+    shell:
+        "python -m kibs_steps.single --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
+        " --links {output.links:q} --seams {output.seams:q} --corners {output.corners:q} > {log:q} 2>&1"
 
 
 given = inputs("truth", "results/{scene}/truth.parquet")
@@ -167,6 +214,7 @@ rule stitch:
         tiling=lambda w: plan(w).tiling,
         tolerance=lambda w: plan(w).tolerance,
         reach=lambda w: plan(w).reach,
+        seams=lambda w: plan(w).seam_rule,
         folders=lambda w: [
             f"results/{w.scene}/blocks/{b.name}/{source(w)}"
             for b in plan(w).having("feed")
@@ -174,5 +222,5 @@ rule stitch:
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"
-        " --reach {params.reach}"
+        " --reach {params.reach} --seam-rule {params.seams}"
         " --folders {params.folders:q} --sections {output.sections:q} --corners {output.corners:q} > {log:q} 2>&1"

@@ -11,33 +11,39 @@ TRAIN = {
 
 
 rule trained:
-    """Train the network of one task within its time budget and export it as ONNX with its contract."""
-    input:
-        start=lambda w: "models/{name}/sections.onnx" if w.task == "corners" else [],
+    """Train the network within its time budget."""
     output:
-        "models/{name}/{task}.onnx",
+        "runs/{name}/checkpoint.pt",
     log:
-        "runs/{name}/{task}.log",
+        "runs/{name}/training.log",
     conda:
         LEARN
     params:
         data=TRAIN["data"],
         minutes=TRAIN["minutes"],
         options=[f"--seed={TRAIN['seed']}", f"--tiles={TRAIN['tiles']}"],
-        init=lambda w: (
-            [f"--init=runs/{w.name}/sections/checkpoint.pt"]
-            if w.task == "corners"
-            else []
-        ),
     shell:
-        "(python -m kibs_steps.learn.training --task {wildcards.task} --data {params.data:q}"
-        " --minutes {params.minutes} {params.options:q} {params.init:q} --out runs/{wildcards.name:q}/{wildcards.task}"
-        " && python -m kibs_steps.learn.export --checkpoint runs/{wildcards.name:q}/{wildcards.task}/checkpoint.pt"
-        " --pool runs/{wildcards.name:q}/pool --out {output:q}) > {log:q} 2>&1"
+        "python -m kibs_steps.learn.training --data {params.data:q} --minutes {params.minutes} {params.options:q}"
+        " --pool runs/{wildcards.name:q}/pool --out runs/{wildcards.name:q} > {log:q} 2>&1"
+
+
+rule exported:
+    """Export the trained network as the ONNX model of one task, with its contract."""
+    input:
+        "runs/{name}/checkpoint.pt",
+    output:
+        "models/{name}/{task}.onnx",
+    log:
+        "runs/{name}/export_{task}.log",
+    conda:
+        LEARN
+    shell:
+        "python -m kibs_steps.learn.export --checkpoint {input:q} --task {wildcards.task}"
+        " --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
 
 
 rule train:
-    """Train both networks of a model set (config key `train`: name, data, minutes, seed, tiles)."""
+    """Train a model set (config key `train`: name, data, minutes, seed, tiles)."""
     input:
         expand(
             "models/{name}/{task}.onnx",

@@ -119,6 +119,30 @@ rule preview:
         " --out {output:q} > {log:q} 2>&1"
 
 
+given = inputs("buildings", "results/{scene}/paper.tif")
+
+
+rule paper_picture:
+    """paper.tif: sections and corners in the paper's colours (mode=paper)."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        dtm=given("results/{scene}/dtm.tif"),
+        sections=given("results/{scene}/buildings.parquet"),
+        corners=given(blocks("filed_corners.parquet")),
+        models=given(licensed),
+    output:
+        "results/{scene}/paper.tif",
+    log:
+        "results/{scene}/logs/paper_picture.log",
+    conda:
+        RUN
+    params:
+        signature=signature("buildings"),
+    shell:
+        "python -m kibs_steps.publish.paper_picture --scene {input.scene:q} --sections {input.sections:q}"
+        " --corners {input.corners:q} --models {input.models:q} --out {output:q} > {log:q} 2>&1"
+
+
 given = inputs("run", "results/{scene}/run.json")
 
 

@@ -1,0 +1,42 @@
+"""The sweep reads where geometry says; fixed blocks stay fixed."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="networks need the extra `learn` (torch)")
+
+from kibs_steps.learn import training  # noqa: E402
+from kibs_steps.learn.architectures import SWEPT, Sweep  # noqa: E402
+
+
+def test_sweep_finds_base_and_shadow_of_a_pole():
+    """A pole's top at height h, its base and its shadow's tip, each marked in a channel, meet at the top in the step of h."""
+    height, stride = 8.0, 4
+    view, sun = np.array([-1.0, -2.0]), np.array([2.0, 0.5])  # px per metre
+    base = np.array([66.0, 70.0])
+    top, tip = base + height * view, base + height * sun
+    features = torch.zeros(1, 2, 32, 32)
+    for channel, (col, row) in enumerate((base, tip)):
+        # Bilinear weights of a point mark, so that reading there gives their sum of squares, the largest anywhere near.
+        x, y = col / stride - 0.5, row / stride - 0.5
+        for i in (int(y), int(y) + 1):
+            for j in (int(x), int(x) + 1):
+                features[0, channel, i, j] = (1 - abs(x - j)) * (1 - abs(y - i))
+    geometry = torch.tensor([[*view, *sun, 1.0, 1.0]], dtype=torch.float32)
+    read = Sweep(stride)(features, geometry).reshape(2, 2, len(SWEPT), 32, 32)
+    col, row = (top / stride - 0.5).round().astype(int)
+    assert read[0, 0, :, row, col].argmax() == SWEPT.index(8)
+    assert read[1, 1, :, row, col].argmax() == SWEPT.index(8)
+
+
+def test_the_first_blocks_do_not_change_while_training():
+    model = training.network().train()
+    before = {k: v.clone() for k, v in model.encoder.state_dict().items()}
+    optimiser = torch.optim.AdamW(model.parameters(), lr=0.1)
+    raw = model.logits(torch.randn(1, 3, 64, 64), torch.zeros(1, 6))
+    sum(v.square().mean() for v in raw.values()).backward()
+    optimiser.step()
+    after = model.encoder.state_dict()
+    fixed = ("_conv_stem.", "_bn0.", *(f"_blocks.{i}." for i in range(model.encoder.fixed)))
+    assert all(torch.equal(after[k], v) for k, v in before.items() if k.startswith(fixed))
+    assert not torch.equal(after["_blocks.3._project_conv.weight"], before["_blocks.3._project_conv.weight"])

@@ -1,0 +1,184 @@
+"""A user's raster and annotation to samples, against the renderer's own labels; splits that do not leak."""
+
+import json
+
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kibs_steps import view
+from kibs_steps.grid import Window
+from kibs_steps.learn import dataset, own
+from kibs_steps.simulate import scene as simulation
+
+SIZE, TILE = 300, 120
+ANGLES = ["--view-azimuth=181.1", "--view-elevation=59.3", "--sun-azimuth=155", "--sun-elevation=45"]
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory):
+    """A simulated raster on a slope with its annotation, and what the renderer says of every pixel."""
+    folder = tmp_path_factory.mktemp("city")
+    size = ["--seed=5", f"--size={SIZE}", "--gsd=0.38", "--style=suburb", "--slope=10"]
+    simulation.main([*size, *ANGLES, "--out", str(folder)])
+    grid = simulation.Grid("EPSG:32631", *simulation._origin("EPSG:32631", 0.38), 0.38, SIZE, SIZE)
+    turned = simulation.convergence(grid)
+    directions = [simulation.Direction(a, e, view.lean(a, e, turned)) for a, e in ((181.1, 59.3), (155.0, 45.0))]
+    rendering, _ = simulation.simulate(5, grid, *directions, "suburb", 0.0, 0.1)
+    return folder, rendering
+
+
+def prepare(city, out, *options):
+    folder, _ = city
+    own.main(
+        [f"--raster={folder}/scene.tif", f"--dtm={folder}/dtm.tif", *ANGLES, f"--tile={TILE}", f"--out={out}", *options]
+    )
+    samples = {p.stem: (p.parent.name, dataset.load(p)) for p in sorted(out.glob("*/r*.npz"))}
+    return samples, json.loads((out / "own.json").read_text())
+
+
+def window_of(name):
+    at = {p.row * 10 + p.col: p.window for p in own.places(SIZE, SIZE, TILE)}
+    return at[int(name[1:4]) * 10 + int(name[5:8])]
+
+
+@pytest.mark.parametrize("frame", ["map", "image"])
+def test_samples_are_what_the_renderer_shows(city, tmp_path, frame):
+    """Labels, heights at the ground-corrected place and corners of every tile, from either frame of the annotation."""
+    folder, rendering = city
+    z = [] if frame == "map" else ["--truth-z=above_ground"]
+    options = ["--split=shuffle", "--seed=3", f"--truth={folder}/truth.gpkg", f"--truth-frame={frame}", *z]
+    samples, record = prepare(city, tmp_path / "own", *options)
+    assert len(samples) == 9
+    assert record["split"]["tiles"] == {"training": 5, "validation": 2, "testing": 2, "left_out": 0}
+    roofs, both_roofs, ground, both_ground, off, gaps = 0, 0, 0, 0, [], []
+    for name, (_, sample) in samples.items():
+        window = window_of(name)
+        part = np.s_[window.row : window.row + TILE, window.col : window.col + TILE]
+        np.testing.assert_array_equal(sample.rgb, rendering.rgb[part])
+        true = rendering.section[part]
+        both = (true > 0) & (sample.labels > 0)
+        roofs, both_roofs = roofs + (true > 0).sum(), both_roofs + both.sum()
+        ground, both_ground = ground + (true == 0).sum(), both_ground + ((true == 0) & (sample.labels == 0)).sum()
+        for label in np.unique(sample.labels[sample.labels > 0]):
+            inside = true[sample.labels == label]
+            assert inside.size < 30 or np.bincount(inside).max() > 0.8 * inside.size
+        off.append(np.abs(sample.height - rendering.height[part])[both])
+        inner = rendering.corners - [window.col, window.row]
+        expected = inner[((inner > 4) & (inner < TILE - 4)).all(axis=1)]
+        if len(expected):
+            gaps.append(np.linalg.norm(expected[:, None] - sample.corners[None], axis=2).min(axis=1))
+    assert roofs > 2000
+    assert both_roofs > 0.97 * roofs
+    assert both_ground > 0.97 * ground
+    assert np.median(np.concatenate(off)) < 0.03
+    assert (np.concatenate(gaps) < 0.8).mean() > 0.9
+    again, other = prepare(city, tmp_path / "again", *options)
+    assert other == record
+    assert {k: v[0] for k, v in again.items()} == {k: v[0] for k, v in samples.items()}
+
+
+def test_the_truth_comes_back_with_its_split(city, tmp_path):
+    folder, _ = city
+    prepare(city, tmp_path / "own", "--split=shuffle", f"--truth={folder}/truth.gpkg")
+    written = pyogrio.read_dataframe(tmp_path / "own/truth.gpkg")
+    original = pyogrio.read_dataframe(folder / "truth.gpkg", layer="sections_map")
+    assert set(written["section_id"]) <= set(original["section_id"])
+    assert set(written["split"]) == {0, 1, 2}
+    assert shapely.has_z(written.geometry.to_numpy()).all()
+
+
+def test_buildings_without_sections(city, tmp_path):
+    """Roof where an outline is drawn and nowhere else; no sections, no corners, nothing beyond what was annotated."""
+    folder, rendering = city
+    drawn = pyogrio.read_dataframe(folder / "truth.gpkg", layer="sections_image")
+    outline = shapely.force_2d(shapely.union_all(drawn.geometry.to_numpy()))
+    for name, shape in (("buildings", outline), ("annotated", shapely.box(*shapely.bounds(outline)))):
+        pyogrio.raw.write(
+            tmp_path / f"{name}.gpkg",
+            geometry=shapely.to_wkb(np.array([shape])),
+            field_data=[],
+            fields=[],
+            geometry_type=shape.geom_type,
+            crs=drawn.crs.to_string(),
+        )
+    samples, record = prepare(
+        city,
+        tmp_path / "own",
+        f"--buildings={tmp_path}/buildings.gpkg",
+        f"--annotated={tmp_path}/annotated.gpkg",
+        "--split=shuffle",
+    )
+    assert record["corners"]["mean_height"] is None
+    for name, (_, sample) in samples.items():
+        window = window_of(name)
+        true = rendering.section[window.row : window.row + TILE, window.col : window.col + TILE] > 0
+        known = sample.roof != dataset.UNKNOWN
+        assert ((sample.roof == 1) >= true)[known].mean() > 0.99
+        assert (sample.labels[sample.roof == 1] == -1).all()
+        assert (sample.labels[sample.roof == 0] == 0).all()
+        assert not sample.corners_known[sample.roof == 1].any()
+        assert not len(sample.corners)
+
+
+@given(st.integers(5, 400), st.integers(0, 1000))
+def test_the_shuffle_has_exact_shares(count, seed):
+    code = own.shuffled(count, seed)
+    for value, share in enumerate(own.SHARES):
+        assert abs((code == value).sum() - share * count) <= 1
+    np.testing.assert_array_equal(code, own.shuffled(count, seed))
+    assert count < 20 or (code != own.shuffled(count, seed + 1)).any()
+
+
+@given(
+    st.integers(100, 900),
+    st.integers(100, 900),
+    st.integers(20, 100),
+    st.integers(1, 4),
+    st.integers(0, 90),
+    st.integers(0, 99),
+)
+def test_blocks_keep_their_distance(width, height, side, block, buffer, seed):
+    """No training pixel within the buffer of another set's, none shared between sets, and what is left is most of it."""
+    found = own.places(width, height, side)
+    covered = np.zeros((height, width), int)
+    for place in found:
+        w = place.window
+        assert w.col >= 0
+        assert w.col + side <= width
+        covered[w.row : w.row + side, w.col : w.col + side] += 1
+    assert covered.min() >= 1
+    code = own.in_blocks(found, seed, block, buffer)
+    boxes = np.array([shapely.box(*own._bounds(p.window)) for p in found])
+    for one in range(3):
+        for other in range(one + 1, 3):
+            a, b = boxes[code == one], boxes[code == other]
+            if len(a) and len(b):
+                wide = shapely.buffer(a, buffer, cap_style="square", join_style="mitre") if buffer else a
+                tree = shapely.STRtree(b)
+                for shape in wide:
+                    assert not (shapely.area(shapely.intersection(b[tree.query(shape)], shape)) > 1e-9).any()
+    codes = own.shuffled(len({(p.row // block, p.col // block) for p in found}), seed)
+    assert ((code == 2) | (code == own.LEFT_OUT)).sum() >= (2 in codes)
+
+
+def test_points_get_the_split_of_their_tile():
+    found = own.places(100, 50, 50)
+    code = np.array([0, 1])
+    points = np.array([[10.0, 10], [60, 10], [49.9, 49.9], [50, 0]])
+    assert own.codes_of(points, found, code).tolist() == [0, 1, 0, 1]
+    assert own.codes_of(np.array([[10.0, 10], [200, 0]]), found, np.array([own.LEFT_OUT, 1])).tolist() == [2, 2]
+
+
+def test_a_raster_smaller_than_a_tile_is_refused():
+    with pytest.raises(own.NothingToLearn, match="40×90"):
+        own.places(40, 90, 50)
+
+
+def test_pixels_of_outlines_by_their_centres():
+    outlines = np.array([shapely.box(10.4, 20.6, 13.4, 22.4)])
+    inside = own.drawn(outlines, Window(8, 18, 10, 8))
+    assert sorted(zip(*np.nonzero(inside), strict=True)) == [(3, 2), (3, 3), (3, 4)]

@@ -1,0 +1,80 @@
+"""Which set of a suite a scene gets: angles first, then GSD, then the more special one."""
+
+import pytest
+import toy
+
+from kibs_steps.models import contract, suite
+
+PAIR = ("sections", "corners")
+
+
+def trained(**ranges) -> dict:
+    return {"data": ["toy"], "licence": "CC0-1.0", **ranges}
+
+
+def add(folder, name, gsd=0.38, **ranges):
+    """A pair in the folder, told apart by its ending."""
+    for task, make in (("sections", toy.sections_model), ("corners", toy.corners_model)):
+        make(folder / f"{task}{name}.onnx", toy.contract(task, gsd=gsd, trained_on=trained(**ranges)))
+
+
+def chosen(folder, gsd, view=None, sun=None):
+    direction = view and {"azimuth": view[0], "elevation": view[1]}
+    lit = sun and {"azimuth": sun[0], "elevation": sun[1]}
+    one = suite.choose(suite.sets(folder, PAIR), gsd, direction, lit)
+    return one["sections"].path
+
+
+@pytest.mark.parametrize(
+    ("gsd", "expected"),
+    [(0.20, "25"), (0.25, "25"), (0.2501, "25"), (0.30, "38"), (0.38, "38"), (0.5, "50"), (0.7, "50"), (None, "25")],
+)
+def test_the_nearest_gsd_not_finer_than_the_raster(tmp_path, gsd, expected):
+    for size in (0.25, 0.38, 0.50):
+        add(tmp_path, f"-{size * 100:.0f}", gsd=size)
+    assert chosen(tmp_path, gsd).stem == f"sections-{expected}"
+
+
+def test_the_set_that_covers_the_view_wins_over_a_better_gsd(tmp_path):
+    add(tmp_path / "steep", "", gsd=0.38, view_elevation=[70, 90])
+    add(tmp_path / "oblique", "", gsd=0.5, view_elevation=[50, 65])
+    assert chosen(tmp_path, 0.38, (180, 80)).parent.name == "steep"
+    assert chosen(tmp_path, 0.38, (180, 60)).parent.name == "oblique"
+    assert chosen(tmp_path, 0.38, (180, 68.5)).parent.name == "steep"  # nearest, where none covers
+    assert chosen(tmp_path, 0.38).parent.name == "steep"  # unknown angles: the GSD decides
+
+
+def test_azimuths_wrap_and_the_sun_counts(tmp_path):
+    add(tmp_path, "-a", view_azimuth=[350, 20], view_elevation=[50, 90])
+    add(tmp_path, "-b", view_azimuth=[160, 200], view_elevation=[50, 90], sun_elevation=[50, 70])
+    add(tmp_path, "-c", view_azimuth=[160, 200], view_elevation=[50, 90], sun_elevation=[20, 40])
+    assert chosen(tmp_path, 0.38, (5, 60)).stem == "sections-a"
+    assert chosen(tmp_path, 0.38, (181, 60), (150, 60)).stem == "sections-b"
+    assert chosen(tmp_path, 0.38, (181, 60), (150, 30)).stem == "sections-c"
+
+
+def test_the_more_special_of_two_that_cover(tmp_path):
+    add(tmp_path, "-all", view_elevation=[45, 90], view_azimuth=[0, 360])
+    add(tmp_path, "-one", view_elevation=[55, 63], view_azimuth=[171, 191])
+    assert chosen(tmp_path, 0.38, (181.1, 59.3)).stem == "sections-one"
+    assert chosen(tmp_path, 0.38, (90, 59.3)).stem == "sections-all"
+
+
+def test_a_single_set_and_none(tmp_path):
+    with pytest.raises(contract.NotAModel, match="no model at"):
+        suite.sets(tmp_path / "nowhere", PAIR)
+    toy.sections_model(tmp_path / "sections.onnx")
+    with pytest.raises(contract.NotAModel, match=r"corners\.onnx"):
+        suite.sets(tmp_path, PAIR)
+    toy.both_model(tmp_path / "both.onnx")
+    with pytest.raises(contract.NotAModel, match="method=single"):
+        suite.sets(tmp_path, PAIR)
+    (only,) = suite.sets(tmp_path, ("both",))
+    assert only["both"].contract["task"] == "both"
+
+
+def test_a_set_that_disagrees_with_itself_is_refused(tmp_path):
+    add(tmp_path, "")
+    toy.corners_model(tmp_path / "corners.onnx", toy.contract("corners", gsd=0.5))
+    with pytest.raises(contract.ContractMismatch, match="disagree"):
+        suite.sets(tmp_path, PAIR)

@@ -1,0 +1,105 @@
+"""Real Snakemake runs of the two methods, of the paper's mode, and of a suite."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pyogrio
+import pytest
+import rasterio
+import toy
+from test_workflow import command, digests, jobs, run, world
+
+
+@pytest.fixture(scope="session")
+def towns(tmp_path_factory):
+    """One town by two models, and by one model that does both."""
+    two = world(tmp_path_factory.mktemp("two"))
+    run(two)
+    one = world(tmp_path_factory.mktemp("one"))
+    toy.both_model(one / "models/both.onnx")
+    return two, one, run(one, method="single")
+
+
+def test_one_model_gives_what_two_give(towns):
+    two, one, output = towns
+    done = jobs(output)
+    assert not {"sections", "blend", "corners"} & set(done)
+    assert done["single"] == done["tiles"]
+    assert digests(one)["points.txt"] == digests(two)["points.txt"]
+    for layer in ("roof_sections", "roof_sections_image", "buildings", "corners"):
+        frames = [pyogrio.read_dataframe(f / "results/town/city.gpkg", layer=layer) for f in (one, two)]
+        assert len(frames[0]) > 0
+        assert frames[0].equals(frames[1]), layer
+    for name in ("labels.tif", "heights.tif"):
+        with (
+            rasterio.open(one / "results/town" / name) as first,
+            rasterio.open(two / "results/town" / name) as second,
+        ):
+            np.testing.assert_array_equal(first.read(), second.read())
+    assert "both.onnx" in (one / "results/town/run.json").read_text()
+    assert jobs(run(one, method="single")) == {}
+
+
+def test_methods_of_two_scenes_in_one_run(tmp_path):
+    folder = world(tmp_path)
+    toy.both_model(folder / "models/both.onnx")
+    scene = {"raster": "town.tif", "dtm": 100, "models": "models", "block": 4, **toy.VIEW}
+    config = {"scenes": {"a": {**scene, "method": "single"}, "a.b": {**scene, "method": "two_stage"}}}
+    (folder / "config.yaml").write_text(json.dumps(config))
+    plain = command(folder)
+    done = jobs(run_command(folder, plain[: plain.index("--config")]))
+    assert done["single"] == 1
+    assert done["sections"] == done["corners"] == 1
+    assert digests(folder, "a")["points.txt"] == digests(folder, "a.b")["points.txt"]
+
+
+def run_command(folder, words):
+    import subprocess
+
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-5000:]
+    return done.stdout + done.stderr
+
+
+def test_paper_mode_is_one_switch(towns, tmp_path):
+    """Stride s − p, planes by the paper's rule, the picture with its codes: the same sections where tiles see them whole."""
+    two = towns[0]
+    folder = world(tmp_path)
+    run(folder, mode="paper", planes="robust")
+    record = json.loads((folder / "results/town/run.json").read_text())
+    assert record["settings"]["planes"] == "paper"
+    stack = [len(list((f / "results/town/blocks").iterdir())) for f in (folder, two)]
+    assert stack[0] <= stack[1]
+    sections = [
+        pyogrio.read_dataframe(f / "results/town/city.gpkg", layer="roof_sections_image") for f in (folder, two)
+    ]
+    assert abs(len(sections[0]) - len(sections[1])) <= 0.1 * len(sections[1])
+    with rasterio.open(folder / "results/town/paper.tif") as source:
+        red, green, blue = source.read()
+    with rasterio.open(folder / "results/town/labels.tif") as source:
+        labels = source.read(1)
+    assert set(np.unique(blue)) == {0, 220}  # no tile of this raster belongs to a training set
+    assert not green.any()
+    assert (labels[blue > 0] > 0).all()
+    heights = pyogrio.read_dataframe(folder / "results/town/city.gpkg", layer="corners")["height"].to_numpy()
+    expected = {200 + round(h) for h in heights.tolist()}
+    found = set(np.unique(red).tolist()) - {0}
+    assert found <= expected
+    assert len(found) > 3
+    assert not (two / "results/town/paper.tif").exists()
+
+
+def test_the_scene_chooses_from_a_suite(tmp_path):
+    folder = world(tmp_path)
+    for name, elevations in (("steep", [70, 90]), ("oblique", [50, 65])):
+        terms = {"trained_on": {"data": [name], "licence": f"licence of {name}", "view_elevation": elevations}}
+        toy.sections_model(folder / "suite" / name / "sections.onnx", toy.contract("sections", **terms))
+        toy.corners_model(folder / "suite" / name / "corners.onnx", toy.contract("corners", **terms))
+    output = run(folder, models="suite", block=4)
+    assert "licence of oblique" in output
+    assert "licence of steep" not in output
+    assert "suite/oblique/sections.onnx" in (folder / "results/town/run.json").read_text()
+    done = jobs(run(folder, models="suite", block=4, view_elevation=80))
+    assert {"sections", "corners"} <= set(done)
