@@ -272,8 +272,8 @@ def signatures(
     s["stitch"] = h(detected, models["corners"].sha256, settings["mode"], without(*DETECTING))
     s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
     s["buildings"] = h(s["planes"], content("footprints"), without(*STANDING))
-    s["solids"] = h(s["buildings"], settings["lod_label"])
-    s["publish"] = h(s["solids"], without("solids"))
+    s["solids_of_block"] = h(s["buildings"], settings["lod_label"])
+    s["solids"] = h(s["solids_of_block"], without("solids"))
     s["evaluate"] = h(s["planes"], s["truth"], without(*STANDING))
-    s["run"] = h(s["publish"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
+    s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
     return s

@@ -45,7 +45,7 @@ def changed(files, **settings):
     return {step for step in one if one[step] != other[step]}
 
 
-AFTER_DETECTION = {"stitch", "planes", "buildings", "solids", "evaluate", "run"}
+AFTER_DETECTION = {"stitch", "planes", "buildings", "solids_of_block", "solids", "evaluate", "run"}
 
 
 def test_blocks_cover_the_raster(files):
@@ -71,7 +71,7 @@ def test_another_view_leaves_detection_alone(files):
 
 
 def test_planes_rule_and_block(files):
-    assert changed(files, planes="paper") == {"planes", "buildings", "solids", "evaluate", "run"}
+    assert changed(files, planes="paper") == {"planes", "buildings", "solids_of_block", "solids", "evaluate", "run"}
     assert "scene" not in changed(files, block=3)
 
 

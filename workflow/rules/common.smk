@@ -105,8 +105,13 @@ def inputs(step, *outputs):
     return given
 
 
-def blocks(path, step):
-    """A file of every block of the scene, made by that step; blocks that are left out by then do not count."""
+LAST_STEP = {"detected": "feed", "fed": "feed", "solids.parquet": "solids"}
+LAST_STEP |= {"solids.city.jsonl": "solids"}
+
+
+def blocks(path):
+    """A file of every block of the scene; blocks that are left out before it is made do not count."""
+    step = LAST_STEP.get(Path(path).parts[0], "ground")
     return lambda wildcards: [
         f"results/{wildcards.scene}/blocks/{b.name}/{path}"
         for b in plan(wildcards).having(step)
@@ -122,9 +127,7 @@ def detections(wildcards):
     """What `stitch` joins: four files of every block."""
     files = ("pieces.parquet", "links.parquet", "seams.npz", "corners.parquet")
     return [
-        f
-        for name in files
-        for f in blocks(f"{source(wildcards)}/{name}", "feed")(wildcards)
+        f for name in files for f in blocks(f"{source(wildcards)}/{name}")(wildcards)
     ]
 
 
@@ -193,7 +196,10 @@ def todo(p):
     """How many blocks of a scene each step is still to make, by step."""
     fed = p.settings["feed"] == "truth"
     skipped = ("tiles", "sections", "corners") if fed else ("feed",)
-    signed = {step: "planes" if step == "ground" else step for step in BLOCK_FILES}
+    signed = {step: step for step in BLOCK_FILES}
+    signed |= {"ground": "planes", "solids": "solids_of_block"}
+    if p.settings["method"] == "single":
+        signed |= {"sections": "single", "corners": "single"}
     return {
         step: sum(
             not made(

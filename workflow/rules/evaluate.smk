@@ -14,7 +14,7 @@ rule evaluation:
         labels=given("results/{scene}/labels.tif"),
         heights=given("results/{scene}/heights.tif"),
         sections=given("results/{scene}/buildings.parquet"),
-        corners=given(blocks("filed_corners.parquet", "ground")),
+        corners=given(blocks("filed_corners.parquet")),
     output:
         evaluation="results/{scene}/evaluation.json",
         picture="results/{scene}/evaluation.png",

@@ -1,7 +1,7 @@
 # The published files, one rule per format.
 
 
-given = inputs("publish", "results/{scene}/city.gpkg")
+given = inputs("solids", "results/{scene}/city.gpkg")
 
 
 rule geopackage:
@@ -9,8 +9,8 @@ rule geopackage:
     input:
         scene=given("results/{scene}/scene.json"),
         sections=given("results/{scene}/buildings.parquet"),
-        solids=given(blocks("solids.parquet", "solids")),
-        corners=given(blocks("filed_corners.parquet", "ground")),
+        solids=given(blocks("solids.parquet")),
+        corners=given(blocks("filed_corners.parquet")),
         models=given(licensed),
     output:
         "results/{scene}/city.gpkg",
@@ -19,7 +19,7 @@ rule geopackage:
     conda:
         RUN
     params:
-        signature=signature("publish"),
+        signature=signature("solids"),
         tiling=lambda w: plan(w).tiling,
         blocks=failed,
     shell:
@@ -30,7 +30,7 @@ rule geopackage:
 
 
 given = inputs(
-    "publish", "results/{scene}/city.city.json", "results/{scene}/city.city.jsonl"
+    "solids", "results/{scene}/city.city.json", "results/{scene}/city.city.jsonl"
 )
 
 
@@ -38,7 +38,7 @@ rule cityjson:
     """city.city.json and city.city.jsonl."""
     input:
         scene=given("results/{scene}/scene.json"),
-        solids=given(blocks("solids.city.jsonl", "solids")),
+        solids=given(blocks("solids.city.jsonl")),
         models=given(licensed),
     output:
         city="results/{scene}/city.city.json",
@@ -48,7 +48,7 @@ rule cityjson:
     conda:
         RUN
     params:
-        signature=signature("publish"),
+        signature=signature("solids"),
     shell:
         "python -m kibs_steps.publish.cityjson --scene {input.scene:q} --solids {input.solids:q}"
         " --models {input.models:q} --out {output.city:q} --seq {output.sequence:q} > {log:q} 2>&1"
@@ -153,7 +153,7 @@ rule record:
         sources=given(lambda w: [plan(w).raster, *plan(w).terrain_files]),
         models=given(licensed),
         sections=given("results/{scene}/buildings.parquet"),
-        solids=given(blocks("solids.parquet", "solids")),
+        solids=given(blocks("solids.parquet")),
     output:
         "results/{scene}/run.json",
     log:

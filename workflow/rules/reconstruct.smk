@@ -63,7 +63,7 @@ rule buildings:
     """Group the sections of all blocks to buildings."""
     input:
         scene=given("results/{scene}/scene.json"),
-        ground=given(blocks("ground.parquet", "ground")),
+        ground=given(blocks("ground.parquet")),
         footprints=given(
             lambda w: [f for f in [plan(w).settings.get("footprints")] if f]
         ),
@@ -85,7 +85,7 @@ rule buildings:
 
 
 given = inputs(
-    "solids",
+    "solids_of_block",
     "results/{scene}/blocks/{block}/solids.city.jsonl",
     "results/{scene}/blocks/{block}/solids.parquet",
 )
@@ -106,7 +106,7 @@ rule solids:
     conda:
         RUN
     params:
-        signature=signature("solids"),
+        signature=signature("solids_of_block"),
         options=options("lod_label"),
     shell:
         "python -m kibs_steps.solids --scene {input.scene:q} --buildings {input.buildings:q} --name {wildcards.block}"
