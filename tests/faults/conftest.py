@@ -66,6 +66,7 @@ class Town(NamedTuple):
             and p.relative_to(self.results).parts[0] not in ("logs", "benchmarks", "run.json", "report.html")
             and ".sums" not in p.parts
             and p.suffix != ".changed"
+            and not p.name.startswith(".tmp-")
         }
 
     def fault(self, **what: str) -> None:
@@ -106,6 +107,7 @@ def undisturbed(warm, tmp_path_factory) -> Town:
     environment, steps = warm
     town = Town(lay_out(tmp_path_factory.mktemp("town")), environment, steps)
     town.finish()
+    (town.folder / "commands").write_text(town.seen())
     return town
 
 
