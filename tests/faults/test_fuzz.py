@@ -67,9 +67,10 @@ def test_rasters_are_read_or_refused(tmp_path_factory, dtype, bands, size, nodat
     path = tmp_path_factory.mktemp("fuzz") / "a.tif"
     shape = {"count": bands, "height": size[0], "width": size[1], "dtype": dtype}
     try:
+        place = {"crs": crs, "transform": rasterio.Affine(a * scale, b * scale, x, d * scale, e * scale, y)}
         with (
             warnings.catch_warnings(),
-            rasterio.open(path, "w", driver="GTiff", crs=crs, transform=place, nodata=nodata, **shape) as out,
+            rasterio.open(path, "w", driver="GTiff", nodata=nodata, **place, **shape) as out,
         ):
             warnings.simplefilter("ignore")
             out.write(values)
