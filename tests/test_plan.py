@@ -45,7 +45,7 @@ def changed(files, **settings):
     return {step for step in one if one[step] != other[step]}
 
 
-AFTER_PLANES = {"planes", "buildings", "solids", "glb", "evaluate", "run"}
+AFTER_PLANES = {"planes", "buildings", "solids_of_block", "solids", "glb", "evaluate", "run"}
 AFTER_DETECTION = {"stitch", "edited", *AFTER_PLANES}
 
 

@@ -213,6 +213,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--settings", default="{}", help="the scene's settings, JSON text")
     parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
     parser.add_argument("--solids", required=True, nargs="+", help="solids.parquet of all blocks")
+    parser.add_argument("--blocks", help="failed.json: blocks the city is made without, and why")
     parser.add_argument("--benchmarks", help="folder of Snakemake's benchmark files")
     parser.add_argument("--out", required=True, help="out: run.json")
     args = parser.parse_args(argv)
@@ -233,6 +234,7 @@ def main(argv: list[str] | None = None) -> None:
         "settings": json.loads(args.settings),
         "inputs": inputs(args.inputs, scene.folder.parent / ".fingerprints.json"),
         "results": results(sections, solids),
+        "failed_blocks": store.read_json(args.blocks) if args.blocks else {},
         "times": times(args.benchmarks) if args.benchmarks else {},
         "versions": versions(),
     }
