@@ -128,7 +128,7 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     models = models_for(settings, base)
     terms = models["sections"].contract
     # The paper's tiles overlap by p in all, ours by p on each side (PAPER, finding 6).
-    margin = terms["margin"] // 2 if settings["mode"] == "paper" else terms["margin"]
+    margin = max(terms["margin"] // 2, 1) if settings["mode"] == "paper" else terms["margin"]
     tiling = Tiling(terms["tile"], margin, int(settings["block"]))
     cache = results / ".fingerprints.json"
     folder = results / name
