@@ -8,10 +8,36 @@ from collections.abc import Callable
 from kibs_steps.errors import KibsError
 
 
-def run(main: Callable[[], None]) -> None:
-    """Call `main`; a `KibsError` is printed to stderr as it is and ends the process with code 1."""
+def run(main: Callable[[], None], pandas: bool = True) -> None:
+    """Call `main`; a `KibsError` is printed to stderr as it is and ends the process with code 1.
+
+    `pandas` False: the step uses none, and shall not wait half a second for pyarrow to import it.
+    """
+    if not pandas:
+        _leave_pandas_out()
     try:
         main()
     except KibsError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
+
+
+class _NoPandas:
+    """An importer that has no pandas."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError("pandas is left out", name=name)
+
+
+def _leave_pandas_out() -> None:
+    """Let pyarrow find in this process that there is no pandas: it looks once, to know a Series when it is given one."""
+    import pyarrow
+
+    sys.meta_path.insert(0, _NoPandas)
+    try:
+        if hasattr(pyarrow.lib, "_pandas_api"):
+            _ = pyarrow.lib._pandas_api.have_pandas
+    finally:
+        sys.meta_path.remove(_NoPandas)

@@ -45,7 +45,7 @@ def changed(files, **settings):
     return {step for step in one if one[step] != other[step]}
 
 
-AFTER_DETECTION = {"stitch", "planes", "buildings", "solids", "evaluate", "run"}
+AFTER_DETECTION = {"stitch", "edited", "planes", "buildings", "solids", "glb", "evaluate", "run"}
 
 
 def test_blocks_cover_the_raster(files):
@@ -142,3 +142,9 @@ def test_a_simulated_city_reruns_with_its_file(files):
     first = sources()
     city.write_text("{ }")
     assert sources() != first
+
+
+@pytest.mark.parametrize("settings", [{"provider": "openvino"}, {"threads": 2}])
+def test_other_hardware_reruns_the_models_and_nothing_before(files, settings):
+    """Sums in another order differ in their last bits: blocks of both are never mixed."""
+    assert changed(files, **settings) == {"sections", "blend", "corners", "single", *AFTER_DETECTION}

@@ -20,7 +20,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from kibs_steps import cli, fingerprint, store
+from kibs_steps import cli, fingerprint, sources, store
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
 from kibs_steps.publish import licences
@@ -41,6 +41,7 @@ LIBRARIES = (
     "opencv-python-headless",
     "scikit-image",
     "pillow",
+    "trimesh",
 )
 MOST = 20  # reasons listed
 
@@ -68,11 +69,16 @@ def versions() -> dict[str, str | None]:
 
 
 def inputs(paths: list[str], cache: Path) -> list[dict[str, Any]]:
-    """File, size (bytes) and sha256 of the inputs; `cache` as in `fingerprint.of_file`. Raises `InputMissing`."""
+    """File, size (bytes) and sha256 of the inputs; `cache` as in `fingerprint.of_file`. Raises `InputMissing`.
+
+    Of a remote source what its server says: entity tag, date and length.
+    """
+    remote = [{"file": path, "version": sources.version(path)[1:]} for path in paths if sources.is_remote(path)]
+    paths = sources.files(*paths)
     for path in paths:
         if not Path(path).is_file():
             raise InputMissing(f"input {path} is gone: put it back, or build the scene again from its new place")
-    return [
+    return remote + [
         {"file": path, "bytes": Path(path).stat().st_size, "sha256": fingerprint.of_file(path, cache)} for path in paths
     ]
 
@@ -212,4 +218,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

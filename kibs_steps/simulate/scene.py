@@ -90,16 +90,19 @@ def random_scene(
     city_share: float = 0.3,
     houses: Sequence[House] = (),
     house_share: float = 0.2,
+    view: tuple[float, float] | None = None,
+    sun: tuple[float, float] | None = None,
 ) -> tuple[Rendering, np.ndarray]:
     """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md).
 
     `city_share` of the tiles show a part of one of the real `cities`, if there are any; the others are procedural, of one `style`
-    or of any, `house_share` of them with photographed `houses`, if there are any.
+    or of any, `house_share` of them with photographed `houses`, if there are any. `view` and `sun` (azimuth, elevation deg) stand
+    in for random directions within the ranges.
     """
     side = size * gsd
     grid = Grid("", 0.0, side, gsd, size, size)
-    view = _direction(*_random_view(rng, *view_elevation))
-    sun = _direction(rng.uniform(0, 360), rng.uniform(*sun_elevation))
+    seen_from = _direction(*(view or _random_view(rng, *view_elevation)))
+    lit_from = _direction(*(sun or (rng.uniform(0, 360), rng.uniform(*sun_elevation))))
     style = style or str(
         rng.choice([*STYLES, "mixed", "town"], p=[0.17, 0.13, 0.1, 0.11, 0.09, 0.08, 0.02, 0.05, 0.05, 0.03, 0.1, 0.07])
     )
@@ -124,8 +127,8 @@ def random_scene(
     # Tiles with hardly a roof teach little: most of them are drawn again.
     while _roofs_within(city, side) < 4 and rng.random() < 0.75:
         city = build()
-    picture = render(city, terrain, grid, view, sun, rng, backgrounds if rng.random() < 0.5 else None)
-    return picture, geometry_vector(view, sun, gsd)
+    picture = render(city, terrain, grid, seen_from, lit_from, rng, backgrounds if rng.random() < 0.5 else None)
+    return picture, geometry_vector(seen_from, lit_from, gsd)
 
 
 def simulate(

@@ -27,13 +27,17 @@ rule sections:
         scene=using("two_stage"),
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("sections"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.sections --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} > {log:q} 2>&1"
 
@@ -80,12 +84,16 @@ rule corners:
         scene=using("two_stage"),
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("corners"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
     shell:
         "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs(
@@ -116,13 +124,17 @@ rule single:
         scene=using("single"),
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("single"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.single --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} --corners {output.corners:q} > {log:q} 2>&1"
 
@@ -211,8 +223,9 @@ rule stitch:
         folders=lambda w: [
             f"results/{w.scene}/blocks/{b.name}/{source(w)}" for b in plan(w).blocks
         ],
+        corners=lambda w: ["--without-corners"] if measured(plan(w)) else [],
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"
-        " --reach {params.reach} --seam-rule {params.seams}"
+        " --reach {params.reach} --seam-rule {params.seams} {params.corners}"
         " --folders {params.folders:q} --sections {output.sections:q} --corners {output.corners:q} > {log:q} 2>&1"
