@@ -17,7 +17,7 @@ def run(main: Callable[[], None], pandas: bool = True) -> None:
     for pyarrow to import it.
     """
     if not pandas:
-        _leave_pandas_out()
+        sys.meta_path.insert(0, _NoPandas)
     try:
         main()
     except Exception as error:
@@ -52,21 +52,9 @@ def told(error: Exception) -> str | None:
 
 
 class _NoPandas:
-    """An importer that has no pandas."""
+    """An importer that has no pandas: pyarrow looks for it, to know a Series when it is given one, and does without."""
 
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
         if name == "pandas":
-            raise ModuleNotFoundError("pandas is left out", name=name)
-
-
-def _leave_pandas_out() -> None:
-    """Let pyarrow find in this process that there is no pandas: it looks once, to know a Series when it is given one."""
-    import pyarrow
-
-    sys.meta_path.insert(0, _NoPandas)
-    try:
-        if hasattr(pyarrow.lib, "_pandas_api"):
-            _ = pyarrow.lib._pandas_api.have_pandas
-    finally:
-        sys.meta_path.remove(_NoPandas)
+            raise ModuleNotFoundError("this step uses no pandas", name=name)
