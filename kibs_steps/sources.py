@@ -8,8 +8,6 @@ GDAL reads them by windows with range requests, under names of its own: `https:/
 from __future__ import annotations
 
 import re
-import urllib.error
-import urllib.request
 from pathlib import Path
 
 from kibs_steps import fingerprint
@@ -61,6 +59,9 @@ def version(path: str) -> list[str | None]:
     """
     if not path.startswith("/vsicurl/"):
         return [path]
+    import urllib.error
+    import urllib.request
+
     url = path.removeprefix("/vsicurl/")
     try:
         with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=PATIENCE) as answer:

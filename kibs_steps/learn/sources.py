@@ -11,6 +11,7 @@ import argparse
 import multiprocessing
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 
 from kibs_steps import store
 from kibs_steps.learn import dataset
-from kibs_steps.simulate import citymodel
+from kibs_steps.simulate import citymodel, draped
 
 NAMES = ("simulated", "pasted", "chips", "own")
 SHARES = {"simulated": 0.62, "pasted": 0.23, "chips": 0.15, "own": 0.3}  # of those there are, scaled to sum to 1
@@ -72,8 +73,10 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     graphs, chips = [], []
     if args.data:
         data = Path(args.data)
-        graphs = dataset.read_roof_graphs(args.roofgraph or data / "roofgraph" / "roofgraph.tar")
+        roof_graphs = args.roofgraph or data / "roofgraph" / "roofgraph.tar"
+        graphs = dataset.read_roof_graphs(roof_graphs)
         chips = [c for c in dataset.read_chips(data / "chips") if c.name.split("/")[0] not in args.leave_out]
+    training = [graph for graph in graphs if not dataset.held_out(graph)]
     own = [path for folder in args.own for path in sorted(Path(folder, "training").glob("[!.]*.npz"))]
     if args.own and not own:
         raise dataset.NoTrainingData(
@@ -82,12 +85,13 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     view = _direction(args.view_azimuth, args.view_elevation)
     sun = _direction(args.sun_azimuth, args.sun_elevation)
     if args.tiles:
-        look = (args.tiles, args.seed, chips, view, sun, tuple(map(citymodel.read, args.cities)))
+        cities = tuple(map(citymodel.read, args.cities))
+        houses = draped.houses(training, draped.read_heights(roof_graphs)) if training else []
+        look = (args.tiles, args.seed, chips, view, sun, cities, houses)
         multiprocessing.get_context("fork").Process(target=fill_pool, args=(pool, *look), daemon=True).start()
     wanted = {**SHARES, **args.shares}
     if heights_needed:
         wanted |= {"pasted": 0.0, "chips": 0.0}
-    training = [graph for graph in graphs if not dataset.held_out(graph)]
     mixture = dataset.Mixture(pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright)
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
@@ -165,7 +169,8 @@ def fill_pool(
     chips: list[dataset.Chip],
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
-    cities: tuple[citymodel.CityModel, ...] = (),
+    cities: Sequence[citymodel.CityModel] = (),
+    houses: Sequence[draped.House] = (),
 ) -> None:
     """Render simulated tiles into a folder until it holds `count`, leaving what is there."""
     os.nice(10)
@@ -176,7 +181,7 @@ def fill_pool(
         path = pool / f"{seed}-{number:06d}.npz"
         if not path.exists():
             rng = np.random.default_rng([seed, number])
-            sample = dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities)
+            sample = dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities, houses=houses)
             dataset.save(path, sample)
 
 
