@@ -179,7 +179,7 @@ def validated(model: nn.Module, average: Batch, batches: Sequence[Any], terms: C
     """Mean loss of the averaged weights on validation batches; the network itself is left as it was."""
     own = {name: value.clone() for name, value in model.state_dict().items()}
     model.load_state_dict(average)
-    norms = [part for part in model.modules() if isinstance(part, nn.BatchNorm2d)]
+    norms = [part for part in model.modules() if isinstance(part, nn.BatchNorm2d) and part.training]
     for norm in norms:
         norm.eval()
     with torch.no_grad():
