@@ -28,6 +28,7 @@ from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Block, Grid, Tiling
 from kibs_steps.sections import SEAM_RULES, links_across
 
+CUT = 2.0  # px: smoothing moves an outline no further
 SAME_CORNER = 3.0  # px: two tiles' views of one corner lie closer than two corners of a roof
 NEAR = 4.0  # px: sections closer than this are smoothed together; smoothing moves no outline as far
 NUMBERS = ["label", "tile_row", "tile_col", "core_area", "full_area"]
@@ -352,6 +353,22 @@ def stitch(
             yield block, mine, within_reach(corners, outlines, reach)
 
 
+def cut_by(table: pa.Table, missing: np.ndarray) -> pa.Table:
+    """The sections with `void` where they touch an area (px) the city is made without: their outline goes on there."""
+    outlines = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False))
+    cut = np.isin(np.arange(len(table)), shapely.STRtree(missing).query(outlines, "dwithin", distance=CUT)[0])
+    void = table["void"].to_numpy(zero_copy_only=False) | cut
+    return table.set_column(table.column_names.index("void"), "void", pa.array(void, pa.bool_()))
+
+
+def missing_areas(blocks: list[Block], grid: Grid, tiling: Tiling) -> np.ndarray:
+    """The cores (px) of the grid's blocks that are not among `blocks`."""
+    cores = [
+        tiling.block_core(b, grid.width, grid.height) for b in tiling.blocks(grid.width, grid.height) if b not in blocks
+    ]
+    return np.array([shapely.box(c.col, c.row, c.col + c.width, c.row + c.height) for c in cores], object)
+
+
 def owner_blocks(ids: np.ndarray, grid: Grid, tiling: Tiling) -> np.ndarray:
     """Block (row, col) (n, 2) whose core holds each section's id pixel."""
     row, col = np.divmod(ids - 1, grid.width)
@@ -386,9 +403,10 @@ def main(argv: list[str] | None = None) -> None:
         ),
     )
     blocks = [tiling.block_of(name) for name in folders]
+    missing = missing_areas(blocks, facts.grid, tiling)
     with store.by_block(args.sections, SECTIONS) as sections, store.by_block(args.corners, CORNERS) as corners:
         for block, mine, near in stitch(blocks, found, facts.grid, tiling, args.tolerance, args.reach, args.seam_rule):
-            sections(block.name, mine)
+            sections(block.name, cut_by(mine, missing))
             corners(block.name, near)
 
 

@@ -24,7 +24,7 @@ from kibs_steps.terrain import Terrain
 
 STEP = 0.25  # m of height between two looks along a ray
 POINTS = 48  # about as many per section
-INSIDE = 1.5  # px from the rim, where a surface model mixes roof and ground
+INSIDE = 1.0  # px from the rim, where a surface model mixes roof and ground
 SIGMA = 0.3  # m, of one height in an ordinary DSM
 
 
@@ -51,15 +51,15 @@ def first_met(seen: np.ndarray, lean: np.ndarray, base: np.ndarray, surface: Ter
 
 
 def points_in(outline: shapely.Geometry) -> np.ndarray:
-    """About `POINTS` points (n, 2 px) on a lattice inside an outline, off its rim where it is wide enough."""
+    """About `POINTS` points (n, 2 px) inside an outline, off its rim where it is wide enough: a lattice, and the corners."""
     inner = shapely.buffer(outline, -INSIDE)
     inner = outline if inner.is_empty else inner
     step = max(np.sqrt(inner.area / POINTS), 0.5)
     x0, y0, x1, y1 = inner.bounds
     x, y = np.meshgrid(np.arange(x0 + step / 2, x1, step), np.arange(y0 + step / 2, y1, step))
     found = np.column_stack([x.ravel(), y.ravel()])
-    found = found[shapely.contains_xy(inner, *found.T)]
-    return found if len(found) else shapely.get_coordinates(shapely.point_on_surface(inner))
+    corners = shapely.get_coordinates(shapely.simplify(inner, 0.5))[: POINTS // 2]
+    return np.unique(np.concatenate([found[shapely.contains_xy(inner, *found.T)], corners]), axis=0)
 
 
 def measured(

@@ -46,10 +46,11 @@ def read(
 
     With a `step` (m) only every so many pixels are read, as far apart as that or a little less.
     """
-    import rasterio
     from rasterio.windows import Window
 
-    with rasterio.open(path) as source:
+    from kibs_steps import raster
+
+    with raster.opened(path) as source:
         t = source.transform
         left, right = (bounds[0] - margin - t.c) / t.a, (bounds[2] + margin - t.c) / t.a
         top, bottom = (bounds[3] + margin - t.f) / t.e, (bounds[1] - margin - t.f) / t.e

@@ -73,7 +73,7 @@ def _values(source: rasterio.DatasetReader, scene: Scene, window: Window) -> tup
         place = rasterio.windows.Window(window.col + offset[0], window.row + offset[1], window.width, window.height)
         return imagery.read(source, scene.bands, scene.nodata, window=place)
     place = rasterio.windows.Window(*window)
-    with on_grid(source, scene.grid, scene.nodata) as warped:
+    with imagery.reading(source, place), on_grid(source, scene.grid, scene.nodata) as warped:
         alpha = warped.colorinterp.index(ColorInterp.alpha) + 1
         values = warped.read([*scene.bands, alpha], window=place)
     return values[:3], values[3] > 0

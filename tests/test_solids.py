@@ -370,10 +370,10 @@ def test_a_block_is_written_with_attributes_and_semantics(tmp_path):
         solids.main(
             [*arguments, "--name", name, "--lod-label", "2.2", "--out", str(out), "--attributes", str(attributes)]
         )
-        head, *features = [json.loads(line) for line in out.read_text().splitlines()]
+        head, *lines = [json.loads(line) for line in out.read_text().splitlines()]
         rows = pq.read_table(attributes)
         assert rows.schema.equals(features.ATTRIBUTES)
-        assert (len(features), len(rows)) == (expected, expected)
+        assert (len(lines), len(rows)) == (expected, expected)
         assert head["transform"]["scale"] == [0.001] * 3
     head, feature = [json.loads(line) for line in (tmp_path / "r000c000.city.jsonl").read_text().splitlines()]
     (row,) = pq.read_table(tmp_path / "r000c000.parquet").to_pylist()

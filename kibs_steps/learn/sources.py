@@ -102,7 +102,8 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
         for i in range(args.validation)
     ]
     validation = [prepared(sample, size, upright) for sample in validation]
-    return Sources(mixture, validation, about(args, bool(graphs), bool(chips), view, sun))
+    simulates = bool(args.tiles) or any(pool.glob("[!.]*.npz"))
+    return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
 
 
 def prepared(sample: dataset.Sample, size: int, upright: bool) -> dataset.Sample:
@@ -114,13 +115,14 @@ def prepared(sample: dataset.Sample, size: int, upright: bool) -> dataset.Sample
 
 def about(
     args: argparse.Namespace,
+    simulates: bool,
     graphs: bool,
     chips: bool,
     view: tuple[float, float] | None,
     sun: tuple[float, float] | None,
 ) -> dict[str, Any]:
     """`trained_on` of the contract: data and licence of the sources used, angles, and heights of own corners."""
-    data = ["simulated scenes"] if args.tiles or args.pool else []
+    data = ["simulated scenes"] if simulates else []
     data += [f"simulated scenes of the city in {Path(city).name}" for city in args.cities]
     data += ["roof-graph photographs (Ren et al. 2021), pasted"] if graphs else []
     without = f", without {', '.join(args.leave_out)}" if args.leave_out else ""
@@ -129,7 +131,6 @@ def about(
     licence = NON_COMMERCIAL if graphs or chips else OWN if args.own else SIMULATED
     found: dict[str, Any] = {"data": data, "licence": licence}
     records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
-    simulates = bool(args.tiles or args.pool)
     for name, direction in (("view", view), ("sun", sun)):
         # Simulated tiles show all directions unless one is asked for; own ones alone show theirs.
         shown = [direction] if simulates else [tuple(r[name]) if r[name] else None for r in records]
@@ -148,7 +149,7 @@ def about(
 
 def told(name: str, shown: list[tuple[float, float] | None]) -> dict[str, list[float] | None]:
     """The ranges (deg) of a contract for tiles shown from these directions (azimuth, elevation); None: no range is known."""
-    if None in shown:
+    if not shown or None in shown:
         return {f"{name}_azimuth": None, f"{name}_elevation": None}
     azimuth, elevation = np.array(shown).T
     turned = (azimuth - azimuth[0] + 180) % 360 - 180 + azimuth[0]

@@ -44,6 +44,8 @@ LIBRARIES = (
     "trimesh",
 )
 MOST = 20  # reasons listed
+SIMPLER = ("1.3", "1.2", "0")  # levels of detail below a full roof, whatever that is called
+MOSTLY = 0.9
 
 
 class InputMissing(KibsError):
@@ -135,7 +137,29 @@ def results(sections: pa.Table, solids: pa.Table) -> dict[str, Any]:
             "position_corrected": sum(map(bool, solids["position_corrected"].to_pylist())),
             "roof_type": counted(solids["roof_type"].to_pylist()),
             "reasons": reasons(solids["lod_reason"].to_pylist()),
+            "lod2": lod2(sections, solids),
         },
+    }
+
+
+def lod2(sections: pa.Table, solids: pa.Table) -> dict[str, Any]:
+    """Of the buildings with at least one section of status `ok`, how many are LOD2 in deed.
+
+    A building is, where at least `MOSTLY` of its sections over 4 m² own a roof face within 0.2 m of their plane
+    (`features.faithful`); `share` is None without any such building.
+    """
+    pairs = zip(sections["building_id"].to_pylist(), sections["status"].to_pylist(), strict=True)
+    good = {building for building, status in pairs if status == "ok"}
+    rows = [row for row in solids.to_pylist() if row["building_id"] in good]
+    full = [
+        row for row in rows
+        if row["lod"] not in SIMPLER and (row["faithful"] is None or row["faithful"] >= MOSTLY)
+    ]  # fmt: skip
+    return {
+        "with_ok_section": len(rows),
+        "lod2": len(full),
+        "share": round(len(full) / len(rows), 4) if rows else None,
+        "without_solid": sum(row["lod"] == "0" for row in solids.to_pylist()),
     }
 
 
@@ -189,6 +213,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--settings", default="{}", help="the scene's settings, JSON text")
     parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
     parser.add_argument("--solids", required=True, nargs="+", help="solids.parquet of all blocks")
+    parser.add_argument("--blocks", help="failed.json: blocks the city is made without, and why")
     parser.add_argument("--benchmarks", help="folder of Snakemake's benchmark files")
     parser.add_argument("--out", required=True, help="out: run.json")
     args = parser.parse_args(argv)
@@ -196,8 +221,8 @@ def main(argv: list[str] | None = None) -> None:
     sections, solids = (
         pa.concat_tables([store.read_table(path, columns) for path in paths], promote_options="permissive")
         for paths, columns in (
-            (args.sections, ["status", "status_reason", "split"]),
-            (args.solids, ["lod", "lod_reason", "valid", "position_corrected", "roof_type"]),
+            (args.sections, ["building_id", "status", "status_reason", "split"]),
+            (args.solids, ["building_id", "lod", "lod_reason", "valid", "position_corrected", "roof_type", "faithful"]),
         )
     )
     line = licences.line(args.models)
@@ -209,6 +234,7 @@ def main(argv: list[str] | None = None) -> None:
         "settings": json.loads(args.settings),
         "inputs": inputs(args.inputs, scene.folder.parent / ".fingerprints.json"),
         "results": results(sections, solids),
+        "failed_blocks": store.read_json(args.blocks) if args.blocks else {},
         "times": times(args.benchmarks) if args.benchmarks else {},
         "versions": versions(),
     }

@@ -69,10 +69,10 @@ def test_ranges_span_what_was_shown(shown, azimuth, elevation):
 
 def test_photographs_make_a_model_non_commercial():
     plain = arguments("--tiles=10")
-    assert sources.about(plain, False, False, None, None)["licence"] == sources.SIMULATED
-    assert sources.about(plain, True, True, None, None)["licence"] == sources.NON_COMMERCIAL
-    assert "view_azimuth" not in sources.about(plain, False, False, None, None)
-    tuned = sources.about(plain, False, False, (181.0, 59.0), None)
+    assert sources.about(plain, True, False, False, None, None)["licence"] == sources.SIMULATED
+    assert sources.about(plain, True, True, True, None, None)["licence"] == sources.NON_COMMERCIAL
+    assert "view_azimuth" not in sources.about(plain, True, False, False, None, None)
+    tuned = sources.about(plain, True, False, False, (181.0, 59.0), None)
     assert tuned["view_elevation"] == [56.0, 62.0]
 
 

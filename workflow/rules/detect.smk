@@ -25,6 +25,7 @@ rule sections:
         "results/{scene}/logs/sections/{block}.log",
     wildcard_constraints:
         scene=using("two_stage"),
+    retries: 1
     conda:
         RUN
     threads: lambda w: plan(w).settings["threads"]
@@ -56,6 +57,7 @@ rule blend:
         temp("results/{scene}/blocks/{block}/blended.tif"),
     log:
         "results/{scene}/logs/blend/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -82,6 +84,7 @@ rule corners:
         "results/{scene}/logs/corners/{block}.log",
     wildcard_constraints:
         scene=using("two_stage"),
+    retries: 1
     conda:
         RUN
     threads: lambda w: plan(w).settings["threads"]
@@ -122,6 +125,7 @@ rule single:
         "results/{scene}/logs/single/{block}.log",
     wildcard_constraints:
         scene=using("single"),
+    retries: 1
     conda:
         RUN
     threads: lambda w: plan(w).settings["threads"]
@@ -151,6 +155,7 @@ rule truth:
         "results/{scene}/truth.parquet",
     log:
         "results/{scene}/logs/truth.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -183,6 +188,7 @@ rule feed:
         corners="results/{scene}/blocks/{block}/fed/corners.parquet",
     log:
         "results/{scene}/logs/feed/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -212,6 +218,7 @@ rule stitch:
         corners="results/{scene}/stitched/corners.parquet",
     log:
         "results/{scene}/logs/stitch.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -221,7 +228,8 @@ rule stitch:
         reach=lambda w: plan(w).reach,
         seams=lambda w: plan(w).seam_rule,
         folders=lambda w: [
-            f"results/{w.scene}/blocks/{b.name}/{source(w)}" for b in plan(w).blocks
+            f"results/{w.scene}/blocks/{b.name}/{source(w)}"
+            for b in plan(w).having("feed")
         ],
         corners=lambda w: ["--without-corners"] if measured(plan(w)) else [],
     shell:

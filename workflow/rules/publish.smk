@@ -21,10 +21,11 @@ rule geopackage:
     params:
         signature=signature("solids"),
         tiling=lambda w: plan(w).tiling,
+        blocks=failed,
     shell:
         "python -m kibs_steps.publish.geopackage --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --sections {input.sections:q}"
-        " --solids {input.solids:q} --corners {input.corners:q} --models {input.models:q}"
+        " --solids {input.solids:q} --corners {input.corners:q} --models {input.models:q} {params.blocks:q}"
         " --out {output:q} > {log:q} 2>&1"
 
 
@@ -303,7 +304,8 @@ rule record:
         signature=signature("run"),
         settings=lambda w: json.dumps(plan(w).settings),
         remote=lambda w: plan(w).remote,
+        blocks=failed,
     shell:
         "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} {params.remote:q} --models {input.models:q}"
         " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"
-        " --out {output:q} > {log:q} 2>&1"
+        " {params.blocks:q} --out {output:q} > {log:q} 2>&1"

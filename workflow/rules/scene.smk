@@ -90,6 +90,7 @@ rule tiles:
         "results/{scene}/blocks/{block}/tiles.tif",
     log:
         "results/{scene}/logs/tiles/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
