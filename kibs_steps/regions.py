@@ -1,6 +1,6 @@
 """Regions: parts of one raster that were seen from different directions, as the patches of an aerial mosaic.
 
-In: a polygon layer of the user's with `view_azimuth` and `view_elevation` (deg) of each part. Out: `scene.Region`s, for `scene.json`.
+In: a polygon layer with `view_azimuth` and `view_elevation` (deg) of each part. Out: `scene.Region`s, for `scene.json`.
 """
 
 from __future__ import annotations
