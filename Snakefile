@@ -1,7 +1,10 @@
 # KIBS: one off-nadir raster and a terrain model to a LOD2 city. Start with `snakemake --cores 2`; see README.md.
 from pathlib import Path
 
+from kibs_steps import cli, settings
+
 if Path("config.yaml").is_file():
+    cli.or_exit(settings.read, "config.yaml")
 
     configfile: "config.yaml"
 
@@ -36,6 +39,16 @@ onstart:
             logger.warning(f"{p.name}: {warning}")
 
 
+onsuccess:
+    for p in PLANS.values():
+        if not p.left_out:
+            Path(f"results/{p.name}", failures.RECORD).unlink(missing_ok=True)
+
+
+onerror:
+    report_failures(workflow.scheduler.failed, workflow.scheduler._user_kill)
+
+
 rule all:
     """Build every scene."""
     default_target: True
@@ -59,3 +72,31 @@ rule simulate:
     """Make the simulated scenes, no further."""
     input:
         [p.raster for p in PLANS.values() if p.settings.get("simulate")],
+
+
+rule verify:
+    """Compare all files of every scene with their checksums, and take away what must be made again."""
+    log:
+        "results/verify.log",
+    conda:
+        RUN
+    params:
+        folders=[f"results/{name}" for name in PLANS],
+        temporary=TEMPORARY,
+    shell:
+        "python -m kibs_steps.verify {params.folders:q} --temporary {params.temporary:q} 2>&1 | tee {log:q}"
+
+
+rule check:
+    """Say what a run would do, how long it would take, and what is doubtful about the inputs."""
+    log:
+        "results/check.log",
+    conda:
+        RUN
+    params:
+        base=str(workflow.basedir),
+        scenes=json.dumps({name: p.settings for name, p in PLANS.items()}),
+        todo=lambda w: json.dumps({name: todo(p) for name, p in PLANS.items()}),
+    shell:
+        "python -m kibs_steps.check --base {params.base:q} --results results --scenes {params.scenes:q}"
+        " --todo {params.todo:q} 2>&1 | tee {log:q}"

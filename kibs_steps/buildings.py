@@ -22,8 +22,8 @@ import pyarrow as pa
 import shapely
 
 from kibs_steps import cli, scene, store
-from kibs_steps.errors import KibsError
 from kibs_steps.grid import Tiling
+from kibs_steps.inputs import FootprintsUnusable
 from kibs_steps.planes import middle_of
 from kibs_steps.stitch import groups, owner_blocks
 from kibs_steps.view import Lean
@@ -34,11 +34,7 @@ SLACK = 0.5  # m, the same where a step explains the gap
 STEP = 3.0  # m, higher steps divide buildings
 FACING = -0.7  # cosine between the directions of two outlines that face each other
 OVERLAP = 0.25  # m², sections over each other by as much are together
-AT_ONCE = 2_000_000  # edge pairs held in memory
-
-
-class FootprintsUnusable(KibsError):
-    """Footprints that cannot be read as polygons."""
+AT_ONCE = 250_000  # edge pairs held in memory
 
 
 def buildings(

@@ -48,6 +48,10 @@ class DtmAbsurd(KibsError):
     """Heights that are no heights on Earth, or whose unit is unknown."""
 
 
+class DtmDatum(KibsError):
+    """A terrain model whose heights are counted from another zero than the scene's."""
+
+
 class Canvas(NamedTuple):
     """The raster to be written: transform and size; `rows(first, last)` gives its heights in metres, NaN in holes."""
 
@@ -72,16 +76,71 @@ def write(dtm: str | Path | float, grid: Grid, footprint: np.ndarray, path: str 
             with _writing(path, canvas, grid.crs) as target:
                 _fill(canvas, coarse, target)
         return {"source": str(dtm), "step": [canvas.transform.a, -canvas.transform.e], "filled": round(filled, 6)}
-    if not abs(height) <= HIGHEST:
-        raise DtmAbsurd(
-            f"dtm={dtm}: the ground cannot be {height} m high; give metres above the scene's vertical datum"
-        )
+    check_number(height)
     left, bottom, right, top = grid.bounds
     side = max(right - left, top - bottom) + 2 * AROUND
     canvas = Canvas(Affine(side / 2, 0.0, left - AROUND, 0.0, -side / 2, top + AROUND), 2, 2, lambda first, last: None)
     with _writing(path, canvas, grid.crs) as target:
         target.write(np.full((1, 2, 2), height, np.float32))
     return {"source": height, "step": None, "filled": 0.0}
+
+
+def check_number(height: float) -> None:
+    """Raise `DtmAbsurd` for a number that is no height (m) on Earth."""
+    if not abs(height) <= HIGHEST:
+        raise DtmAbsurd(
+            f"dtm={height:g}: the ground cannot be {height:g} m high; give metres above the scene's vertical datum"
+        )
+
+
+def check(dtm: str, grid: Grid, footprint: np.ndarray, vertical_crs: str | None = None) -> list[str]:
+    """Look at a terrain model, a number or a file's header: placed, in a known unit and datum, as large as the scene.
+
+    Returns what is doubtful. Raises `DtmMissing`, `DtmPartial`, `DtmAbsurd`, `DtmDatum`.
+    """
+    try:
+        check_number(float(dtm))
+    except ValueError:
+        with _opened(dtm) as source:
+            return _doubts(source, grid, footprint, vertical_crs)
+    return []
+
+
+def _doubts(source: rasterio.DatasetReader, grid: Grid, footprint: np.ndarray, vertical_crs: str | None) -> list[str]:
+    imagery.complete(source)
+    with _canvas(source, grid) as canvas:
+        _covered_area(source, grid, footprint, canvas)
+    _check_datum(source, vertical_crs)
+    crs = imagery.crs_of(source)
+    in_feet = crs.is_projected and crs.axis_info[0].unit_conversion_factor != 1.0
+    if in_feet and not (source.units[0] or "").strip() and metres_per_unit(source) == 1.0:
+        return [
+            f"dtm {source.name} is in a CRS in feet and does not say its heights' unit: metres are assumed; if they are feet, "
+            "say so (gdal_edit.py -units ft)"
+        ]
+    return []
+
+
+def _check_datum(source: rasterio.DatasetReader, vertical_crs: str | None) -> None:
+    """Refuse a terrain model that says another vertical datum than `vertical_crs`."""
+    import pyproj
+
+    if vertical_crs is None:
+        return
+    own = pyproj.CRS.from_wkt(source.crs.to_wkt())
+    wanted = pyproj.CRS.from_user_input(vertical_crs)
+    if own.is_compound:
+        there = own.sub_crs_list[1]
+        same, called = there.datum.name == wanted.datum.name, there.name
+    elif len(own.axis_info) == 3:
+        same, called = False, "ellipsoidal heights"
+    else:
+        return
+    if not same:
+        raise DtmDatum(
+            f"dtm {source.name} has {called}, vertical_crs={vertical_crs} is {wanted.name}: convert the terrain model (gdalwarp "
+            "-t_srs with a compound CRS), or give the vertical_crs it has"
+        )
 
 
 @contextlib.contextmanager
@@ -123,7 +182,8 @@ def _canvas(source: rasterio.DatasetReader, grid: Grid):
     factor, scale, offset = metres_per_unit(source), source.scales[0], source.offsets[0]
 
     def heights(dataset: rasterio.DatasetReader, window: Window) -> np.ndarray:
-        values = dataset.read(1, window=window, out_dtype="float32")
+        with imagery.reading(source, window):
+            values = dataset.read(1, window=window, out_dtype="float32")
         if (factor, scale, offset) != (1.0, 1.0, 0.0):
             values = ((values * np.float64(scale) + offset) * factor).astype(np.float32)
         values[(dataset.read_masks(1, window=window) == 0) | ~np.isfinite(values)] = np.nan

@@ -20,7 +20,7 @@ import pyarrow as pa
 import shapely
 from numpy.typing import NDArray
 
-from kibs_steps import cli, metrics, store, truth
+from kibs_steps import cli, metrics, store, sums, truth
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid, Window
@@ -88,6 +88,8 @@ def read_through(scene: Scene, sections: Truth, labels: str, heights: str, fallb
     split_of = _lookup(sections.ids, sections.split, 2)
     pairs, corners = [], []
     found, everything = metrics.no_errors(n_groups), metrics.no_errors(n_groups)
+    for path in (labels, heights):
+        sums.check(path)
     with rasterio.Env(GDAL_CACHEMAX=CACHE), rasterio.open(labels) as label_file, rasterio.open(heights) as height_file:
         for file in (label_file, height_file):
             _check_grid(file, grid)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from kibs_steps import store
+from kibs_steps.errors import KibsError
 
 
 def of_file(path: str | Path, cache: str | Path) -> str:
@@ -21,7 +22,7 @@ def of_file(path: str | Path, cache: str | Path) -> str:
     key = f"{path.resolve()} {facts.st_size} {facts.st_mtime_ns}"
     try:
         known = store.read_json(cache)
-    except (OSError, store.DamagedFile):
+    except (OSError, KibsError):
         known = {}
     if key not in known:
         digest = hashlib.sha256()

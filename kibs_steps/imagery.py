@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kibs_steps import sources
 from kibs_steps.errors import KibsError
 
 if TYPE_CHECKING:
@@ -37,6 +38,10 @@ class NotARaster(KibsError):
     """A file that cannot be read as a raster."""
 
 
+class RasterDamaged(KibsError):
+    """A raster whose header is sound and whose pixels cannot be read."""
+
+
 class NotGeoreferenced(KibsError):
     """A raster that does not say where on Earth it lies."""
 
@@ -55,21 +60,54 @@ def opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
-    with warnings.catch_warnings():
+    remote = sources.is_remote(str(path))
+    settings = {"GDAL_CACHEMAX": CACHE, **(sources.GDAL if remote else {})}
+    with rasterio.Env(**settings), warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             source = rasterio.open(path)
         except RasterioIOError as error:
-            local = "://" not in str(path) and not str(path).startswith("/vsi")
-            if local and not Path(path).exists():
+            if not remote and not Path(path).exists():
                 raise RasterMissing(f"raster {path} does not exist: check the path") from error
             raise NotARaster(
                 f"{path} cannot be read as a raster ({error}): give a GeoTIFF or another GDAL format"
             ) from error
-    with source, rasterio.Env(GDAL_CACHEMAX=CACHE):
+    with source, rasterio.Env(**settings):
         if not source.count:
             raise NotARaster(f"{path} holds no image of its own: name one of its subdatasets, {source.subdatasets[:3]}")
         yield source
+
+
+def complete(source: rasterio.DatasetReader) -> None:
+    """Raise `RasterDamaged` for a TIFF that ends before its last block: a copy or a download that broke off."""
+    if source.driver != "GTiff" or not Path(source.name).is_file():
+        return
+    size = Path(source.name).stat().st_size
+    bands = source.indexes[:1] if source.interleaving and source.interleaving.name == "pixel" else source.indexes
+    for band in bands:
+        rows, cols = source.block_shapes[band - 1]
+        for j in range(-(-source.height // rows)):
+            for i in range(-(-source.width // cols)):
+                start = source.get_tag_item(f"BLOCK_OFFSET_{i}_{j}", "TIFF", bidx=band)
+                length = source.get_tag_item(f"BLOCK_SIZE_{i}_{j}", "TIFF", bidx=band)
+                if start and length and int(start) + int(length) > size:
+                    raise RasterDamaged(
+                        f"{source.name} is cut off: it has {size} bytes, its pixels go on to byte {int(start) + int(length)} "
+                        "or further: copy or download it again"
+                    )
+
+
+@contextlib.contextmanager
+def reading(source: rasterio.DatasetReader, place: object) -> Iterator[None]:
+    """Raise `RasterDamaged`, naming the place, where pixels cannot be read."""
+    from rasterio.errors import RasterioError
+
+    try:
+        yield
+    except RasterioError as error:
+        raise RasterDamaged(
+            f"{source.name} cannot be read at {place} ({error.__cause__ or error}): the file is damaged; copy it again"
+        ) from error
 
 
 def crs_of(source: rasterio.DatasetReader) -> pyproj.CRS:
@@ -195,10 +233,11 @@ def read(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Raw values (bands, rows, cols) and which pixels hold data; `region` is rasterio's `window` and `out_shape`."""
     shape = region.pop("out_shape", None)
-    values = source.read(list(bands), out_shape=shape and (len(bands), *shape), **region)
-    valid = has_data(values, nodata)
-    if _masked(source):
-        valid &= source.dataset_mask(out_shape=shape, **region) > 0
+    with reading(source, region.get("window", "full size")):
+        values = source.read(list(bands), out_shape=shape and (len(bands), *shape), **region)
+        valid = has_data(values, nodata)
+        if _masked(source):
+            valid &= source.dataset_mask(out_shape=shape, **region) > 0
     return values, valid
 
 

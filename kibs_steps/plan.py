@@ -13,12 +13,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps import fingerprint
-from kibs_steps.errors import KibsError
+from kibs_steps import fingerprint, sources, tiled
+from kibs_steps import settings as user_settings
 from kibs_steps.grid import Block, Tiling
 from kibs_steps.models import contract, suite
+from kibs_steps.settings import BadConfig
 
 RUN_KEYS = ("scene", "scenes", "train")
+DETECTING = ("tiles", "sections", "blend", "corners", "single", "feed")
+STANDING = ("planes", "ground")
+BLOCK_STEPS = (*DETECTING, *STANDING, "solids")  # steps with a job per block, in the order of the data
 DEFAULTS = {
     "models": "research",
     "method": "two_stage",
@@ -29,6 +33,8 @@ DEFAULTS = {
     "truth_frame": "map",
     "truth_z": "absolute",
     "allow_angles": False,
+    "provider": "cpu",
+    "threads": 1,
     "lod_label": "2.0",
     "drape": False,
 }
@@ -39,12 +45,11 @@ REACH = 7.5  # px: half the paper's corner square q = 15, unless the model's con
 TOLERANCE = 1.5  # px: how far smoothing may move a pixel outline
 
 
-class BadConfig(KibsError):
-    """The configuration cannot be used."""
-
-
 class Plan(NamedTuple):
-    """One scene: settings (defaults filled in), its files, grid size, tiles, blocks, models and signatures by step."""
+    """One scene: settings (defaults filled in), its files, grid size, tiles, blocks, models and signatures by step.
+
+    `left_out` are the blocks the city is made without, each from a step on.
+    """
 
     name: str
     settings: dict[str, Any]
@@ -56,15 +61,30 @@ class Plan(NamedTuple):
     models: dict[str, contract.Model]
     signature: dict[str, str]
     warnings: list[str]
+    left_out: dict[str, str]
+
+    def having(self, step: str) -> list[Block]:
+        """The blocks that are not left out at that step or before."""
+        done = BLOCK_STEPS[: BLOCK_STEPS.index(step) + 1]
+        return [b for b in self.blocks if self.left_out.get(b.name) not in done]
 
     @property
     def terrain_files(self) -> list[str]:
-        """The terrain file, or nothing where the terrain is a number."""
+        """The terrain file, or nothing where the terrain is a number or remote."""
         try:
             float(self.dtm)
         except ValueError:
-            return [self.dtm]
+            return sources.files(self.dtm)
         return []
+
+    @property
+    def remote(self) -> list[str]:
+        """Raster and terrain that are read by URL."""
+        return [path for path in (self.raster, self.dtm) if sources.is_remote(path)]
+
+    def blocks_read(self, copy: str) -> str:
+        """The raster that blocks read: `copy` (a path) where the raster's own layout is too slow."""
+        return copy if self.settings.get("simulate") is None and tiled.needed(self.raster) else self.raster
 
     @property
     def seam_rule(self) -> str:
@@ -84,13 +104,7 @@ class Plan(NamedTuple):
 
 def scenes(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of every scene to build, by name, after the schema; defaults are filled in. Raises `BadConfig`."""
-    import jsonschema
-
-    check = jsonschema.Draft202012Validator(schema)
-    error = jsonschema.exceptions.best_match(check.iter_errors(config))
-    if error:
-        place = ".".join(map(str, error.absolute_path)) or "config"
-        raise BadConfig(f"{place}: {error.message}")
+    user_settings.check(config, schema)
     common = {k: v for k, v in config.items() if k not in RUN_KEYS}
     listed = config.get("scenes") or {}
     wanted = [str(config["scene"])] if config.get("scene") else list(listed)
@@ -98,7 +112,7 @@ def scenes(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, dict[str
         raise BadConfig(
             "no scene to build: add one under `scenes:` in config.yaml, or give --config scene=NAME raster=FILE"
         )
-    return {name: {**DEFAULTS, **(listed.get(name) or {}), **common} for name in wanted}
+    return {str(name): {**DEFAULTS, **(listed.get(name) or {}), **common} for name in wanted}
 
 
 def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan:
@@ -114,7 +128,7 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     models = models_for(settings, base)
     terms = models["sections"].contract
     # The paper's tiles overlap by p in all, ours by p on each side (PAPER, finding 6).
-    margin = terms["margin"] // 2 if settings["mode"] == "paper" else terms["margin"]
+    margin = max(terms["margin"] // 2, 1) if settings["mode"] == "paper" else terms["margin"]
     tiling = Tiling(terms["tile"], margin, int(settings["block"]))
     cache = results / ".fingerprints.json"
     folder = results / name
@@ -146,16 +160,31 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
             raise BadConfig(
                 f"scene {name}: which terrain? Give dtm=FILE, or dtm=NUMBER for flat ground at that height (m)"
             )
-        dtm = str(dtm)
+        raster, dtm = sources.place(raster), sources.place(str(dtm))
         width, height = grid_size(raster, terms["gsd"], settings.get("aoi"))
-        source = [fingerprint.of_file(f, cache) if Path(f).is_file() else f for f in (raster, dtm)]
+        source = [sources.content(f, cache) for f in (raster, dtm)]
         truth_source = fingerprint.of_file(truth, cache) if truth and Path(truth).is_file() else truth
     if settings["feed"] == "truth" and not truth:
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
     blocks = tiling.blocks(width, height)
-    signature = signatures(settings, source, truth_source, models, tiling, cache)
+    left_out = leaving_out(name, str(settings.get("leave_out") or ""), blocks)
+    signature = signatures(settings, source, truth_source, models, tiling, cache, left_out)
     warnings = [] if settings["feed"] == "truth" else angle_warnings(settings, models)
-    return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings)
+    return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings, left_out)
+
+
+def leaving_out(name: str, text: str, blocks: list[Block]) -> dict[str, str]:
+    """The blocks of one scene that `leave_out=SCENE/BLOCK/STEP,…` names, with the step each is left out from."""
+    found = {}
+    for item in filter(None, text.split(",")):
+        scene, block, step = [*item.split("/"), "", ""][:3]
+        if step not in BLOCK_STEPS:
+            raise BadConfig(f"leave_out: {item}: give SCENE/BLOCK/STEP, the step one of {', '.join(BLOCK_STEPS)}")
+        if scene == name:
+            if block not in {b.name for b in blocks}:
+                raise BadConfig(f"leave_out: {item}: the scene has blocks {blocks[0].name} to {blocks[-1].name}")
+            found[block] = step
+    return dict(sorted(found.items()))
 
 
 def angles_of(settings: dict[str, Any]) -> dict[str, float]:
@@ -217,10 +246,20 @@ def grid_size(raster: str, gsd: float, aoi: str | None) -> tuple[int, int]:
 
 
 def signatures(
-    settings: dict[str, Any], source: Any, truth: Any, models: dict[str, contract.Model], tiling: Tiling, cache: Path
+    settings: dict[str, Any],
+    source: Any,
+    truth: Any,
+    models: dict[str, contract.Model],
+    tiling: Tiling,
+    cache: Path,
+    left_out: dict[str, str],
 ) -> dict[str, str]:
     """Signature of every step: each hashes what it uses itself and the signatures it builds on."""
     h = fingerprint.of_values
+
+    def without(*steps: str) -> list[str]:
+        return sorted(block for block, step in left_out.items() if step in steps)
+
     pick = {k: settings.get(k) for k in settings}
 
     def some(*keys: str) -> list[Any]:
@@ -244,14 +283,16 @@ def signatures(
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
-    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"])
+    inference = some("provider", "threads")  # sums in another order differ in their last bits
+    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"], inference)
     s["blend"] = h(s["sections"], models["corners"].sha256)
-    s["corners"] = h(s["blend"], seen["corners"])
+    s["corners"] = h(s["blend"], seen["corners"], inference)
     s["single"] = h(s["sections"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.
     detected = s["single" if settings["method"] == "single" else "sections" if settings.get("dsm") else "corners"]
-    s["stitch"] = h(s["feed"] if settings["feed"] == "truth" else detected, models["corners"].sha256, settings["mode"])
+    detected = s["feed"] if settings["feed"] == "truth" else detected
+    s["stitch"] = h(detected, models["corners"].sha256, settings["mode"], without(*DETECTING))
     s["edited"] = h(s["stitch"], s["scene"], content("sections")) if settings.get("sections") else s["stitch"]
     s["surface"] = h(s["scene"], content("dsm"))
     s["planes"] = h(
@@ -261,9 +302,10 @@ def signatures(
         settings["planes"],
         s["surface"] if settings.get("dsm") else None,
     )
-    s["buildings"] = h(s["planes"], content("footprints"))
-    s["solids"] = h(s["buildings"], settings["lod_label"])
-    s["evaluate"] = h(s["planes"], s["truth"])
+    s["buildings"] = h(s["planes"], content("footprints"), without(*STANDING))
+    s["solids_of_block"] = h(s["buildings"], settings["lod_label"])
+    s["solids"] = h(s["solids_of_block"], without("solids"))
+    s["evaluate"] = h(s["planes"], s["truth"], without(*STANDING))
     s["glb"] = h(s["solids"], settings["drape"])
     s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
     return s

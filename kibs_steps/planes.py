@@ -333,4 +333,4 @@ def map_bounds(sections: pa.Table, facts: scene.Scene) -> tuple[float, float, fl
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +12,9 @@ import rasterio
 from affine import Affine
 from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
-from kibs_steps import store
+from kibs_steps import store, sums
 
-FORMAT = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate", "zlevel": 1}
+FORMAT = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "zstd", "zstd_level": 1}
 
 
 def write(path: str | Path, image: np.ndarray, crs: str | None = None, transform: Affine | None = None) -> None:
@@ -28,11 +30,29 @@ def write(path: str | Path, image: np.ndarray, crs: str | None = None, transform
 
 def read(path: str | Path) -> np.ndarray:
     """Read an image as (rows, cols) or (rows, cols, bands); a damaged file raises `store.DamagedFile`."""
+    sums.check(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path) as source:
                 bands = source.read()
     except RasterioIOError as error:
-        raise store.DamagedFile(f"{path} is damaged ({error}): delete it and run the same command again") from error
+        raise sums.damaged(path, error) from error
     return bands[0] if bands.shape[0] == 1 else bands.transpose(1, 2, 0)
+
+
+@contextlib.contextmanager
+def opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
+    """A raster of this workflow, open to be read window by window, each checked; raises `store.DamagedFile`."""
+    with sums.opened(path) as file:
+
+        def opener(name: str, mode: str = "rb", **_: object):
+            if name != str(path):
+                raise FileNotFoundError(name)
+            return file
+
+        try:
+            with rasterio.open(str(path), opener=opener) as source:
+                yield source
+        except RasterioIOError as error:
+            raise sums.damaged(path, error) from error

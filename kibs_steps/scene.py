@@ -314,11 +314,14 @@ def facts(source: rasterio.DatasetReader, gsd: float, bands: tuple[int, ...] | N
 
     from kibs_steps import imagery
 
+    imagery.complete(source)
     chosen, doubt = imagery.colour_bands(source, bands)
     warnings = [doubt] if doubt else []
     nodata = imagery.nodata_of(source)
     values, valid = imagery.sample(source, chosen, nodata)
     black = float((valid & (values == 0).all(axis=0)).mean())
+    if nodata is None and black == 1.0:
+        raise imagery.NoData(f"{source.name} is black everywhere: give the image itself, not a mask or an empty copy")
     if nodata is None and black > 0.05:
         warnings.append(
             f"{100 * black:.0f} % of {source.name} is black (0,0,0) and counts as data: if it is missing data, declare it "
@@ -378,7 +381,7 @@ def build(
         "sun": direction(*sun, grid, "sun", lowest=5.0),
     }
     parts = region_layer.read(regions, grid) if regions else ()
-    _check_vertical(vertical_crs)
+    check_vertical(vertical_crs)
     if projection_height is not None and not abs(projection_height) <= terrain_model.HIGHEST:
         raise terrain_model.DtmAbsurd(f"projection_height={projection_height} is no height on Earth: give metres")
     with imagery.opened(raster) as source:
@@ -386,8 +389,9 @@ def build(
         footprint = imagery.outline(source, pyproj.CRS.from_user_input(grid.crs))
     if not shapely.Polygon(footprint).intersection(shapely.box(*grid.bounds)).area:
         raise AoiUnusable(f"aoi {aoi} lies beside the raster {raster}, which is turned in its CRS: move it")
+    doubts = terrain_model.check(str(dtm), grid, footprint, vertical_crs)
     ground = terrain_model.write(dtm, grid, footprint, Path(folder) / "dtm.tif")
-    warnings = found.pop("warnings")
+    warnings = found.pop("warnings") + doubts
     if ground["filled"]:
         warnings.append(
             f"dtm {dtm} has no data on {100 * ground['filled']:.2f} % of the scene: filled from its neighbours"
@@ -410,7 +414,8 @@ def build(
     return read(Path(folder) / "scene.json")
 
 
-def _check_vertical(vertical_crs: str | None) -> None:
+def check_vertical(vertical_crs: str | None) -> None:
+    """Raise `VerticalCrsUnusable` for a vertical CRS that is none."""
     import pyproj
 
     if vertical_crs is None:

@@ -8,6 +8,7 @@ Height above ground is z − DTM at the ground-corrected position (PAPER, data a
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -83,8 +84,40 @@ class Truth(NamedTuple):
 
 
 def read_layer(path: str | Path, frame: str) -> Layer:
-    """The polygons of a vector file: layer `sections_image` or `sections_map` by frame if there is one (or the layers
-    of this project's own `city.gpkg`), else the first layer of polygons. Multipolygons are exploded, holes kept.
+    """The polygons of a vector file's layer (`layer_of`). Multipolygons are exploded, holes kept, outlines that cross
+    themselves repaired, with a warning.
+    """
+    import pyogrio
+
+    name, meta = layer_of(path, frame)
+    meta, _, wkb, fields = pyogrio.raw.read(path, layer=name)
+
+    parts, source = _sound(shapely.from_wkb(wkb), f"truth {path}, layer {name}")
+    if not len(parts):
+        raise NoPolygons(f"truth {path}, layer {name}, has no polygons")
+    named = dict(zip(meta["fields"], fields, strict=True))
+    wanted = ("section_id", "truth_id", "building_id", "building", "split", "visible")
+    columns = {key: named[key][source] for key in wanted if key in named}
+    return Layer(name, meta["crs"], parts, columns)
+
+
+def _sound(shapes: NDArray[np.object_], called: str) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    """Single valid polygons with an area, and the row each comes from."""
+    crossed = ~shapely.is_valid(shapes) & ~shapely.is_missing(shapes)
+    if crossed.any():
+        rows = ", ".join(map(str, np.flatnonzero(crossed)[:5] + 1))
+        print(f"warning: {called}: {crossed.sum()} outlines cross themselves (rows {rows}): repaired", file=sys.stderr)
+        shapes = shapes.copy()
+        shapes[crossed] = shapely.make_valid(shapes[crossed])
+    parts, source = shapely.get_parts(shapes, return_index=True)
+    deeper, inner = shapely.get_parts(parts, return_index=True)
+    keep = (shapely.get_type_id(deeper) == shapely.GeometryType.POLYGON) & (shapely.area(deeper) > 0)
+    return deeper[keep], source[inner][keep]
+
+
+def layer_of(path: str | Path, frame: str) -> tuple[str, dict]:
+    """The layer of a vector file that is read, and pyogrio's facts about it: `sections_image` or `sections_map` by frame if
+    there is one (or the layers of this project's own `city.gpkg`), else the first layer of polygons.
     """
     import pyogrio
 
@@ -97,18 +130,10 @@ def read_layer(path: str | Path, frame: str) -> Layer:
     if not (known or drawn):
         raise NoPolygons(f"truth {path} has no layer of polygons (its layers: {', '.join(layers) or 'none'})")
     name = (known or drawn)[0]
-    meta, _, wkb, fields = pyogrio.raw.read(path, layer=name)
-    if not meta["crs"]:
+    facts = pyogrio.read_info(path, layer=name)
+    if not facts["crs"]:
         raise UnreadableTruth(f"truth {path}, layer {name}, states no CRS: set it, for instance with ogr2ogr -a_srs")
-
-    parts, source = shapely.get_parts(shapely.from_wkb(wkb), return_index=True)
-    keep = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & ~shapely.is_empty(parts)
-    if not keep.any():
-        raise NoPolygons(f"truth {path}, layer {name}, has no polygons")
-    named = dict(zip(meta["fields"], fields, strict=True))
-    wanted = ("section_id", "truth_id", "building_id", "building", "split", "visible")
-    columns = {key: named[key][source[keep]] for key in wanted if key in named}
-    return Layer(name, meta["crs"], parts[keep], columns)
+    return name, facts
 
 
 def to_grid(layer: Layer, grid: Grid) -> NDArray[np.object_]:

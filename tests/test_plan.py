@@ -45,7 +45,7 @@ def changed(files, **settings):
     return {step for step in one if one[step] != other[step]}
 
 
-AFTER_PLANES = {"planes", "buildings", "solids", "glb", "evaluate", "run"}
+AFTER_PLANES = {"planes", "buildings", "solids_of_block", "solids", "glb", "evaluate", "run"}
 AFTER_DETECTION = {"stitch", "edited", *AFTER_PLANES}
 
 
@@ -163,3 +163,9 @@ def test_a_simulated_city_reruns_with_its_file(files):
     first = sources()
     city.write_text("{ }")
     assert sources() != first
+
+
+@pytest.mark.parametrize("settings", [{"provider": "openvino"}, {"threads": 2}])
+def test_other_hardware_reruns_the_models_and_nothing_before(files, settings):
+    """Sums in another order differ in their last bits: blocks of both are never mixed."""
+    assert changed(files, **settings) == {"sections", "blend", "corners", "single", *AFTER_DETECTION}

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from kibs_steps import store
+from kibs_steps import store, sums
 
 
 def write_half(path):
@@ -31,7 +31,7 @@ class TestWhole:
             assert not (tmp_path / "a.city.json").exists()
             assert temporary.name.endswith("a.city.json")
             assert temporary.parent == tmp_path
-        assert [path.name for path in tmp_path.iterdir()] == ["a.city.json"]
+        assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["a.city.json"]
         assert (tmp_path / "a.city.json").stat().st_mode & 0o777 == 0o644
 
 
@@ -50,7 +50,7 @@ class TestJson:
     @pytest.mark.parametrize("content", [b"", b'{"a": 1', b"\xff\xfe\x00"])
     def test_damage(self, tmp_path, content):
         (tmp_path / "a.json").write_bytes(content)
-        with pytest.raises(store.DamagedFile, match="delete it"):
+        with pytest.raises(store.DamagedFile, match="is deleted now"):
             store.read_json(tmp_path / "a.json")
 
 
@@ -74,11 +74,11 @@ class TestTables:
     def test_damage(self, tmp_path, kept):
         store.write_table(tmp_path / "a.parquet", self.TABLE)
         (tmp_path / "a.parquet").write_bytes((tmp_path / "a.parquet").read_bytes()[:kept])
-        with pytest.raises(store.DamagedFile, match="delete it"):
+        with pytest.raises(store.DamagedFile, match="is deleted now"):
             store.read_table(tmp_path / "a.parquet")
 
     def test_a_missing_file_is_not_damage(self, tmp_path):
-        with pytest.raises(FileNotFoundError):
+        with pytest.raises(sums.MissingFile, match="is gone"):
             store.read_table(tmp_path / "a.parquet")
 
 
@@ -96,7 +96,7 @@ class TestArrays:
     def test_truncation(self, tmp_path, kept):
         store.write_arrays(tmp_path / "a.npz", self.ARRAYS)
         (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:kept])
-        with pytest.raises(store.DamagedFile, match="delete it"):
+        with pytest.raises(store.DamagedFile, match="is deleted now"):
             store.read_arrays(tmp_path / "a.npz")
 
     def test_flipped_bytes(self, tmp_path):
@@ -104,5 +104,29 @@ class TestArrays:
         content = bytearray((tmp_path / "a.npz").read_bytes())
         content[200:260] = bytes(60)
         (tmp_path / "a.npz").write_bytes(content)
-        with pytest.raises(store.DamagedFile, match="delete it"):
+        with pytest.raises(store.DamagedFile, match="is deleted now"):
             store.read_arrays(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("cuts", [[], [3], [10, 11, 40], list(range(1, 60, 7))])
+def test_merged_tables_are_one_sorted_table(tmp_path, cuts):
+    """Whatever the cut into files and row groups, rows come in order, all of them, in parts."""
+    rng = np.random.default_rng(len(cuts))
+    ids = np.arange(60) + rng.integers(-6, 7, 60)  # out of order by less than a file
+    table = pa.table({"id": ids, "x": rng.normal(size=60)})
+    paths = []
+    for k, part in enumerate(np.split(np.arange(60), cuts)):
+        paths.append(tmp_path / f"{k}.parquet")
+        store.write_by_block(
+            paths[-1], {"a": table.take(part[::2]), "none": table.slice(0, 0), "b": table.take(part[1::2])}
+        )
+    parts = list(store.merged(paths[::-1], ["id", "x"], ["id", "x"]))
+    assert pa.concat_tables(parts).equals(table.sort_by([("id", "ascending"), ("x", "ascending")]))
+    assert len(cuts) < 3 or len(parts) > 2
+
+
+def test_merging_nothing_gives_the_columns(tmp_path):
+    store.write_table(tmp_path / "a.parquet", pa.table({"id": pa.array([], pa.int64())}))
+    (part,) = store.merged([tmp_path / "a.parquet"], ["id"])
+    assert part.column_names == ["id"]
+    assert len(part) == 0

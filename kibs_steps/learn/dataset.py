@@ -21,6 +21,7 @@ from kibs_steps.models import runtime
 
 if TYPE_CHECKING:
     from kibs_steps.simulate.citymodel import CityModel
+    from kibs_steps.simulate.draped import House
 
 GSD = 0.38  # m per px of the models trained here
 GRAPH_GSD = 0.06  # m per px, about, of the roof-graph photographs
@@ -148,11 +149,13 @@ def simulated(
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
     cities: Sequence[CityModel] = (),
+    houses: Sequence[House] = (),
 ) -> Sample:
     """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere.
 
     `backgrounds` are photographs (rgb, usable as ground: bool) for the simulator's ground. `view` and `sun` (azimuth, elevation
-    deg) fix the directions but for a degree or two, for models of one scene. Some tiles show one of the real `cities`.
+    deg) fix the directions but for a degree or two, for models of one scene. Some tiles show one of the real `cities`, some
+    photographed `houses` (`simulate.draped`).
     """
     from kibs_steps.simulate.scene import random_scene
 
@@ -166,6 +169,7 @@ def simulated(
         view=near(view, rng),
         sun=near(sun, rng),
         cities=cities,
+        houses=houses,
     )
     section = rendering.section.astype(np.int32)
     return Sample(

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from kibs_steps import cli, store
-from kibs_steps.learn import dataset, maskrcnn, training
+from kibs_steps.learn import dataset, losses, maskrcnn, training
 from kibs_steps.learn.architectures import OUTPUTS
 from kibs_steps.models import contract as contracts
 
@@ -73,8 +73,8 @@ def contract_of(
     if task != "sections" and family == "dense":
         mean, sigma = heights or (6.0, 4.0)
         contract["heights"] = {
-            "edges": training.EDGES.tolist(),
-            "centres": training.CENTRES.tolist(),
+            "edges": losses.EDGES.tolist(),
+            "centres": losses.CENTRES.tolist(),
             "fallback": round(mean, 2),
             "fallback_sigma": round(sigma, 2),
         }

@@ -119,7 +119,7 @@ def _box(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 
 def normalised(images: torch.Tensor) -> torch.Tensor:
-    """uint8 (…, 3, h, w) to network input, as `input_terms` says."""
+    """uint8 (…, 3, h, w) to network input, as `contract_terms` says."""
     mean, std = (torch.tensor(values, device=images.device)[:, None, None] for values in (MEAN, STD))
     return (images.float() - mean) / std
 

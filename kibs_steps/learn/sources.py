@@ -11,6 +11,7 @@ import argparse
 import multiprocessing
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 
 from kibs_steps import store
 from kibs_steps.learn import dataset
-from kibs_steps.simulate import citymodel
+from kibs_steps.simulate import citymodel, draped
 
 NAMES = ("simulated", "pasted", "chips", "own")
 SHARES = {"simulated": 0.62, "pasted": 0.23, "chips": 0.15, "own": 0.3}  # of those there are, scaled to sum to 1
@@ -72,8 +73,10 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     graphs, chips = [], []
     if args.data:
         data = Path(args.data)
-        graphs = dataset.read_roof_graphs(args.roofgraph or data / "roofgraph" / "roofgraph.tar")
+        roof_graphs = args.roofgraph or data / "roofgraph" / "roofgraph.tar"
+        graphs = dataset.read_roof_graphs(roof_graphs)
         chips = [c for c in dataset.read_chips(data / "chips") if c.name.split("/")[0] not in args.leave_out]
+    training = [graph for graph in graphs if not dataset.held_out(graph)]
     own = [path for folder in args.own for path in sorted(Path(folder, "training").glob("[!.]*.npz"))]
     if args.own and not own:
         raise dataset.NoTrainingData(
@@ -82,12 +85,13 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     view = _direction(args.view_azimuth, args.view_elevation)
     sun = _direction(args.sun_azimuth, args.sun_elevation)
     if args.tiles:
-        look = (args.tiles, args.seed, chips, view, sun, tuple(map(citymodel.read, args.cities)))
+        cities = tuple(map(citymodel.read, args.cities))
+        houses = draped.houses(training, draped.read_heights(roof_graphs)) if training else []
+        look = (args.tiles, args.seed, chips, view, sun, cities, houses)
         multiprocessing.get_context("fork").Process(target=fill_pool, args=(pool, *look), daemon=True).start()
     wanted = {**SHARES, **args.shares}
     if heights_needed:
         wanted |= {"pasted": 0.0, "chips": 0.0}
-    training = [graph for graph in graphs if not dataset.held_out(graph)]
     mixture = dataset.Mixture(pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright)
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
@@ -98,7 +102,8 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
         for i in range(args.validation)
     ]
     validation = [prepared(sample, size, upright) for sample in validation]
-    return Sources(mixture, validation, about(args, bool(graphs), bool(chips), view, sun))
+    simulates = bool(args.tiles) or any(pool.glob("[!.]*.npz"))
+    return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
 
 
 def prepared(sample: dataset.Sample, size: int, upright: bool) -> dataset.Sample:
@@ -110,13 +115,14 @@ def prepared(sample: dataset.Sample, size: int, upright: bool) -> dataset.Sample
 
 def about(
     args: argparse.Namespace,
+    simulates: bool,
     graphs: bool,
     chips: bool,
     view: tuple[float, float] | None,
     sun: tuple[float, float] | None,
 ) -> dict[str, Any]:
     """`trained_on` of the contract: data and licence of the sources used, angles, and heights of own corners."""
-    data = ["simulated scenes"] if args.tiles or args.pool else []
+    data = ["simulated scenes"] if simulates else []
     data += [f"simulated scenes of the city in {Path(city).name}" for city in args.cities]
     data += ["roof-graph photographs (Ren et al. 2021), pasted"] if graphs else []
     without = f", without {', '.join(args.leave_out)}" if args.leave_out else ""
@@ -125,7 +131,6 @@ def about(
     licence = NON_COMMERCIAL if graphs or chips else OWN if args.own else SIMULATED
     found: dict[str, Any] = {"data": data, "licence": licence}
     records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
-    simulates = bool(args.tiles or args.pool)
     for name, direction in (("view", view), ("sun", sun)):
         # Simulated tiles show all directions unless one is asked for; own ones alone show theirs.
         shown = [direction] if simulates else [tuple(r[name]) if r[name] else None for r in records]
@@ -144,7 +149,7 @@ def about(
 
 def told(name: str, shown: list[tuple[float, float] | None]) -> dict[str, list[float] | None]:
     """The ranges (deg) of a contract for tiles shown from these directions (azimuth, elevation); None: no range is known."""
-    if None in shown:
+    if not shown or None in shown:
         return {f"{name}_azimuth": None, f"{name}_elevation": None}
     azimuth, elevation = np.array(shown).T
     turned = (azimuth - azimuth[0] + 180) % 360 - 180 + azimuth[0]
@@ -164,7 +169,8 @@ def fill_pool(
     chips: list[dataset.Chip],
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
-    cities: tuple[citymodel.CityModel, ...] = (),
+    cities: Sequence[citymodel.CityModel] = (),
+    houses: Sequence[draped.House] = (),
 ) -> None:
     """Render simulated tiles into a folder until it holds `count`, leaving what is there."""
     os.nice(10)
@@ -175,7 +181,7 @@ def fill_pool(
         path = pool / f"{seed}-{number:06d}.npz"
         if not path.exists():
             rng = np.random.default_rng([seed, number])
-            sample = dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities)
+            sample = dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities, houses=houses)
             dataset.save(path, sample)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from kibs_steps import cli, store
 from kibs_steps.errors import KibsError
 
 KEY = "kibs"
+LARGEST = 2**31 - 1  # bytes: protobuf reads no more
 WARN_BEYOND, REFUSE_BEYOND = (
     3.0,
     5.0,
@@ -32,6 +34,14 @@ class NotAModel(KibsError):
 
 class NoContract(KibsError):
     """The model has no contract, neither inside nor beside it."""
+
+
+class ExternalData(KibsError):
+    """A model that keeps weights in other files."""
+
+
+class ModelTooLarge(KibsError):
+    """A model file that is larger than an ONNX file can be."""
 
 
 class ContractMismatch(KibsError):
@@ -88,6 +98,9 @@ def load(path: str | Path, task: str | None = None) -> Model:
     path = Path(path)
     if not path.is_file():
         raise NotAModel(f"no model at {path}: give `models=` a folder with sections.onnx and corners.onnx")
+    size = path.stat().st_size
+    if size > LARGEST:
+        raise ModelTooLarge(f"{path} has {size / 2**30:.1f} GiB, an ONNX file at most 2: give a smaller model")
     data = path.read_bytes()
     try:
         proto = onnx.load_model_from_string(data)
@@ -96,6 +109,12 @@ def load(path: str | Path, task: str | None = None) -> Model:
             raise ValueError("no graph")
     except Exception as error:  # protobuf raises its own kinds, by version
         raise NotAModel(f"{path} is not an ONNX model ({type(error).__name__})") from error
+    elsewhere = next(_external(proto.graph), None)
+    if elsewhere is not None:
+        raise ExternalData(
+            f"{path} keeps weights outside itself, in {elsewhere}: save it as one file (onnx.save_model of the loaded model with "
+            "save_as_external_data=False), so that its checksum stands for all of it"
+        )
     sidecar = path.with_suffix(".json")
     try:
         if KEY in found:
@@ -113,6 +132,21 @@ def load(path: str | Path, task: str | None = None) -> Model:
     if task and contract["task"] not in (task, "both"):
         raise ContractMismatch(f"{path} is a model of {contract['task']}, used here for {task}: swap the files?")
     return Model(path, hashlib.sha256(data).hexdigest(), contract)
+
+
+def _external(graph: Any) -> Iterator[str]:
+    """Names of the files in which a graph, or one inside it, keeps tensors."""
+    from onnx.external_data_helper import uses_external_data
+
+    tensors = list(graph.initializer)
+    for node in graph.node:
+        for attribute in node.attribute:
+            tensors += [attribute.t, *attribute.tensors]
+            for inner in (attribute.g, *attribute.graphs):
+                yield from _external(inner)
+    for tensor in tensors:
+        if uses_external_data(tensor):
+            yield next((entry.value for entry in tensor.external_data if entry.key == "location"), "?")
 
 
 def agree(models: list[Model]) -> None:

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
 from kibs_steps.blend import rims
 
@@ -70,6 +69,8 @@ def dense_sections(
     mask = roof > thresholds["roof"]
     if not mask.any():
         return Sections(np.zeros(roof.shape, np.int32), np.zeros(0, np.float32))
+    from scipy import ndimage
+
     level = ndimage.gaussian_filter((distance - edge).astype(np.float32), SMOOTH)
     basins = flood(summits(level, mask), mask, level)
     labels = joined_basins(basins, level, thresholds.get("prominence", PROMINENCE))
@@ -102,6 +103,8 @@ def traits(labels: np.ndarray, roof: np.ndarray, edge: np.ndarray, distance: np.
 
 def summits(level: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Local maxima of `level` (s, s) among 8 neighbours of the mask, plateaus as one, labelled 1…n: one or more an area."""
+    from scipy import ndimage
+
     inside = np.where(mask, level, -np.inf)
     return ndimage.label(mask & (inside >= ndimage.maximum_filter(inside, size=3)), np.ones((3, 3)))[0]
 
@@ -125,6 +128,9 @@ def joined_basins(basins: np.ndarray, level: np.ndarray, prominence: float) -> n
         passes.append(np.column_stack([pair, np.minimum(level[a][differ], level[b][differ])]))
     passes = np.concatenate(passes)
     passes = passes[np.lexsort((passes[:, 1], passes[:, 0], -passes[:, 2]))]
+    # Where the highest pass between two basins does not join them no lower one does.
+    highest = np.unique(passes[:, :2], axis=0, return_index=True)[1]
+    passes = passes[np.sort(highest)]
     parent = np.arange(n + 1)
 
     def root(i: int) -> int:
@@ -203,6 +209,8 @@ def instance_sections(outputs: dict[str, np.ndarray], size: int, thresholds: dic
 
 def pasted(box: np.ndarray, mask: np.ndarray, size: int) -> tuple[tuple[slice, slice], np.ndarray]:
     """A box's (x0, y0, x1, y1) window of the tile and the mask's probabilities there, bilinear."""
+    from scipy import ndimage
+
     x0, y0 = np.floor(np.maximum(box[:2], 0)).astype(int)
     x1, y1 = np.ceil(np.minimum(box[2:], size)).astype(int)
     x1, y1 = max(x1, x0 + 1), max(y1, y0 + 1)
@@ -231,18 +239,25 @@ def dense_corners(
 
     `corner` (s, s), `offset` (2, s, s) px from the pixel's centre, `height` (B, s/k, s/k) for any stride k.
     """
-    peak = (corner >= thresholds["corner"]) & (corner >= ndimage.maximum_filter(corner, size=5, mode="constant"))
+    peak = (corner >= thresholds["corner"]) & (corner >= cv2.dilate(corner, np.ones((5, 5), np.uint8)))
     row, col = np.nonzero(peak)
     score = corner[row, col].astype(np.float64)
     x = col + 0.5 + offset[0, row, col]
     y = row + 0.5 + offset[1, row, col]
     k = corner.shape[0] / height.shape[1]
-    at = [np.clip(y / k - 0.5, 0, height.shape[1] - 1), np.clip(x / k - 0.5, 0, height.shape[2] - 1)]
-    distribution = (
-        np.stack([ndimage.map_coordinates(plane, at, order=1) for plane in height]) if len(row) else height[:, :0, 0]
-    )
-    mean, sigma = height_moments(distribution, heights)
+    mean, sigma = height_moments(bilinear(height, y / k - 0.5, x / k - 0.5), heights)
     return Corners(x.astype(np.float64), y.astype(np.float64), mean, sigma, score)
+
+
+def bilinear(maps: np.ndarray, row: np.ndarray, col: np.ndarray) -> np.ndarray:
+    """Values (B, n) of maps (B, rows, cols) at places between pixel centres; beyond the outermost ones the edge holds."""
+    row, col = np.clip(row, 0, maps.shape[1] - 1), np.clip(col, 0, maps.shape[2] - 1)
+    top, left = row.astype(np.int64), col.astype(np.int64)
+    below, right = np.minimum(top + 1, maps.shape[1] - 1), np.minimum(left + 1, maps.shape[2] - 1)
+    down, along = row - top, col - left
+    above = maps[:, top, left] * (1 - along) + maps[:, top, right] * along
+    under = maps[:, below, left] * (1 - along) + maps[:, below, right] * along
+    return above * (1 - down) + under * down
 
 
 def instance_corners(outputs: dict[str, np.ndarray], heights: dict[str, Any], thresholds: dict[str, float]) -> Corners:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kibs_steps import cli, scene, store
+from kibs_steps import cli, scene, store, sums
 from kibs_steps.publish import licences
 
 CRS_URL = "https://www.opengis.net/def/crs/EPSG/0/{}"
@@ -115,6 +115,8 @@ def publish(paths: Sequence[str | Path], out: Path, sequence: Path, known: dict[
 
     Buildings are read one by one, twice; only the vertices of the whole city are held in memory.
     """
+    for path in paths:
+        sums.check(path)
     placed = transform(paths[0])
     lines: list[Line] = []
     every = []

@@ -20,7 +20,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from kibs_steps import cli, fingerprint, store
+from kibs_steps import cli, fingerprint, sources, store
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
 from kibs_steps.publish import licences
@@ -71,11 +71,16 @@ def versions() -> dict[str, str | None]:
 
 
 def inputs(paths: list[str], cache: Path) -> list[dict[str, Any]]:
-    """File, size (bytes) and sha256 of the inputs; `cache` as in `fingerprint.of_file`. Raises `InputMissing`."""
+    """File, size (bytes) and sha256 of the inputs; `cache` as in `fingerprint.of_file`. Raises `InputMissing`.
+
+    Of a remote source what its server says: entity tag, date and length.
+    """
+    remote = [{"file": path, "version": sources.version(path)[1:]} for path in paths if sources.is_remote(path)]
+    paths = sources.files(*paths)
     for path in paths:
         if not Path(path).is_file():
             raise InputMissing(f"input {path} is gone: put it back, or build the scene again from its new place")
-    return [
+    return remote + [
         {"file": path, "bytes": Path(path).stat().st_size, "sha256": fingerprint.of_file(path, cache)} for path in paths
     ]
 
@@ -208,6 +213,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--settings", default="{}", help="the scene's settings, JSON text")
     parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
     parser.add_argument("--solids", required=True, nargs="+", help="solids.parquet of all blocks")
+    parser.add_argument("--blocks", help="failed.json: blocks the city is made without, and why")
     parser.add_argument("--benchmarks", help="folder of Snakemake's benchmark files")
     parser.add_argument("--out", required=True, help="out: run.json")
     args = parser.parse_args(argv)
@@ -228,6 +234,7 @@ def main(argv: list[str] | None = None) -> None:
         "settings": json.loads(args.settings),
         "inputs": inputs(args.inputs, scene.folder.parent / ".fingerprints.json"),
         "results": results(sections, solids),
+        "failed_blocks": store.read_json(args.blocks) if args.blocks else {},
         "times": times(args.benchmarks) if args.benchmarks else {},
         "versions": versions(),
     }
@@ -237,4 +244,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

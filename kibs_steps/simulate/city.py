@@ -95,11 +95,10 @@ def lay_out(site: Site, style: str, houses: Sequence[House] = ()) -> None:
         street(site, ss[0][0], a, ss[-1][1], b)
     decoys = pick(rng, [0.0, 0.5])
     green = 0.12 if style != "farm" else 0.02
-    corner = 0.5 * np.hypot(width, height)
     for s0, s1 in ss:
         for t0, t1 in ts:
-            x, y = site.at(min(max(0.0, s0), s1), min(max(0.0, t0), t1))
-            if np.hypot(x - site.middle[0], y - site.middle[1]) > corner + 25:
+            corners = np.array([site.at(s, t) for s in (s0, (s0 + s1) / 2, s1) for t in (t0, t1)])
+            if (corners.max(0) + 10 < site.area[:2]).any() or (corners.min(0) - 10 > site.area[2:]).any():
                 continue
             name = style
             if style in MIXTURES:

@@ -195,6 +195,17 @@ def street(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
     rng = site.rng
     along_s = (s1 - s0) > (t1 - t0)
     wide = (t1 - t0) if along_s else (s1 - s0)
+    # Only the part that is on the site.
+    start, end = (s0, s1) if along_s else (t0, t1)
+    marks = np.arange(start, end + 12, 12.0)
+    middle = (t0 + t1) / 2 if along_s else (s0 + s1) / 2
+    there = [
+        a for a in marks.tolist() if site.inside(*(site.at(a, middle) if along_s else site.at(middle, a)), 20 + wide)
+    ]
+    if not there:
+        return
+    start, end = max(start, there[0] - 12), min(end, there[-1] + 12)
+    s0, t0, s1, t1 = (start, t0, end, t1) if along_s else (s0, start, s1, end)
     walk = min(rng.uniform(0.8, 3.0), wide * 0.25)
     site.paint_street(s0, t0, s1, t1, "pavement" if rng.random() < 0.8 else "lawn")
 
@@ -204,7 +215,6 @@ def street(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
         else:
             site.paint_street(s0 + a, start, s0 + b, end, use, 0.03)
 
-    start, end = (s0, s1) if along_s else (t0, t1)
     strip(walk, wide - walk, start, end, site.road)
     mark = site.kit.uses["marking"][0]
     if wide > 6.5 and rng.random() < 0.6:

@@ -75,12 +75,9 @@ class Place(NamedTuple):
     def put(self, ring: np.ndarray) -> np.ndarray:
         """A ring (n, 2 or 3) of the building's frame in map metres."""
         c, s = math.cos(self.angle), math.sin(self.angle)
-        out = np.array(ring, float)
-        out[:, 0] = self.x + c * ring[:, 0] - s * ring[:, 1]
-        out[:, 1] = self.y + s * ring[:, 0] + c * ring[:, 1]
-        if out.shape[1] == 3:
-            out[:, 2] += self.base
-        return out
+        if ring.shape[1] == 2:
+            return ring @ np.array([[c, s], [-s, c]]) + (self.x, self.y)
+        return ring @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (self.x, self.y, self.base)
 
 
 @lru_cache(maxsize=16)

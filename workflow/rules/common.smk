@@ -1,30 +1,39 @@
 # What all rules share: the plan of every scene, and functions from wildcards to parameters and inputs.
 
+import atexit
 import json
 import re
+import sys
 from pathlib import Path
 
-import yaml
-from snakemake.exceptions import WorkflowError
 from snakemake.io import IOFile
 
-from kibs_steps import plan as plans
-from kibs_steps.errors import KibsError
+from kibs_steps import cli, failures, inputs as user_inputs, plan as plans, settings
+from kibs_steps import sources
 
 RESULTS = Path("results")
 RUN = f"{workflow.basedir}/envs/run.yaml"
 LEARN = f"{workflow.basedir}/envs/learn.yaml"
+TEMPORARY = ["blended.tif", "tiled.tif"]  # files that Snakemake deletes after use
 
-try:
-    schema = yaml.safe_load(
-        Path(workflow.basedir, "workflow/schemas/config.schema.yaml").read_text()
+
+def planned():
+    """The plan of every scene to build, its inputs checked."""
+    user_inputs.writable(RESULTS)
+    schema = settings.read(
+        Path(workflow.basedir, "workflow/schemas/config.schema.yaml")
     )
-    PLANS = {
-        name: plans.plan(name, settings, Path(workflow.basedir), RESULTS)
-        for name, settings in plans.scenes(config, schema).items()
+    found = {
+        name: plans.plan(name, values, Path(workflow.basedir), RESULTS)
+        for name, values in plans.scenes(config, schema).items()
     }
-except KibsError as error:
-    raise WorkflowError(str(error)) from None
+    if not workflow.remote_exec:
+        for p in found.values():
+            p.warnings.extend(user_inputs.check(p, RESULTS))
+    return found
+
+
+PLANS = cli.or_exit(planned)
 
 
 PUBLISHED = [
@@ -70,6 +79,13 @@ def options(*keys):
     return tokens
 
 
+def made(path, wanted):
+    """Whether a file is there and was made under that signature."""
+    return Path(path).exists() and repr(wanted) in (
+        workflow.persistence.params(IOFile(path)) or []
+    )
+
+
 def inputs(step, *outputs):
     """How jobs with that step's signature and these outputs take their inputs (`given = inputs(…)`, then `given(path)`).
 
@@ -78,15 +94,10 @@ def inputs(step, *outputs):
     for. Otherwise they are plain inputs, and what makes them again makes the outputs again.
     """
 
-    def made(path, wanted):
-        return Path(path).exists() and wanted in (
-            workflow.persistence.params(IOFile(path)) or []
-        )
-
     def given(files):
         def choose(wildcards):
             found = files(wildcards) if callable(files) else files.format(**wildcards)
-            wanted = repr(signature(step)(wildcards))
+            wanted = signature(step)(wildcards)
             if not all(made(output.format(**wildcards), wanted) for output in outputs):
                 return found
             return ancient(
@@ -102,12 +113,22 @@ def inputs(step, *outputs):
     return given
 
 
+LAST_STEP = {"detected": "feed", "fed": "feed", "solids.parquet": "solids"}
+LAST_STEP |= {"solids.city.jsonl": "solids"}
+
+
 def blocks(path):
-    """A file of every block of the scene."""
+    """A file of every block of the scene; blocks that are left out before it is made do not count."""
+    step = LAST_STEP.get(Path(path).parts[0], "ground")
     return lambda wildcards: [
         f"results/{wildcards.scene}/blocks/{b.name}/{path}"
-        for b in plan(wildcards).blocks
+        for b in plan(wildcards).having(step)
     ]
+
+
+def blocks_read(wildcards):
+    """The raster that blocks read: the scene's own, or its tiled copy."""
+    return plan(wildcards).blocks_read(f"results/{wildcards.scene}/tiled.tif")
 
 
 def source(wildcards):
@@ -191,4 +212,58 @@ def kept(p):
         "solids.parquet",
         "solids.city.jsonl",
     ]
-    return [f"results/{p.name}/blocks/{b.name}/{f}" for b in p.blocks for f in files]
+    return [
+        f"results/{p.name}/blocks/{b.name}/{f}"
+        for b in p.having("solids")
+        for f in files
+    ]
+
+
+BLOCK_FILES = {
+    "tiles": "tiles.tif",
+    "sections": "detected/pieces.parquet",
+    "corners": "detected/corners.parquet",
+    "feed": "fed/pieces.parquet",
+    "planes": "planes.parquet",
+    "ground": "ground.parquet",
+    "solids": "solids.parquet",
+}
+
+
+def todo(p):
+    """How many blocks of a scene each step is still to make, by step."""
+    fed = p.settings["feed"] == "truth"
+    skipped = ("tiles", "sections", "corners") if fed else ("feed",)
+    signed = {step: step for step in BLOCK_FILES}
+    signed |= {"ground": "planes", "solids": "solids_of_block"}
+    if p.settings["method"] == "single":
+        signed |= {"sections": "single", "corners": "single"}
+    return {
+        step: sum(
+            not made(
+                f"results/{p.name}/blocks/{b.name}/{name}", p.signature[signed[step]]
+            )
+            for b in p.blocks
+        )
+        for step, name in BLOCK_FILES.items()
+        if step not in skipped
+    }
+
+
+def failed(wildcards):
+    """`--blocks FILE` where the city is made without some blocks: which, and why."""
+    path = RESULTS / wildcards.scene / failures.RECORD
+    return ["--blocks", str(path)] if plan(wildcards).left_out and path.exists() else []
+
+
+def report_failures(jobs, stopped):
+    """After a run that failed: publish the rest of the city, and say at the very end what failed and what to do."""
+    found = failures.of_jobs(jobs)
+    nested = bool(config.get("leave_out"))
+    given = workflow.config_settings.config or {}
+    published = not stopped and failures.publish_rest(
+        found, PLANS, sys.argv[1:], given, RESULTS
+    )
+    if not nested:
+        text = failures.told(found, published, PLANS, RESULTS)
+        atexit.register(print, text, file=sys.stderr, flush=True)

@@ -25,15 +25,20 @@ rule sections:
         "results/{scene}/logs/sections/{block}.log",
     wildcard_constraints:
         scene=using("two_stage"),
+    retries: 1
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("sections"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.sections --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} > {log:q} 2>&1"
 
@@ -52,6 +57,7 @@ rule blend:
         temp("results/{scene}/blocks/{block}/blended.tif"),
     log:
         "results/{scene}/logs/blend/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -78,14 +84,19 @@ rule corners:
         "results/{scene}/logs/corners/{block}.log",
     wildcard_constraints:
         scene=using("two_stage"),
+    retries: 1
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("corners"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
     shell:
         "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs(
@@ -114,15 +125,20 @@ rule single:
         "results/{scene}/logs/single/{block}.log",
     wildcard_constraints:
         scene=using("single"),
+    retries: 1
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("single"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.single --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} --corners {output.corners:q} > {log:q} 2>&1"
 
@@ -139,6 +155,7 @@ rule truth:
         "results/{scene}/truth.parquet",
     log:
         "results/{scene}/logs/truth.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -171,6 +188,7 @@ rule feed:
         corners="results/{scene}/blocks/{block}/fed/corners.parquet",
     log:
         "results/{scene}/logs/feed/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -200,6 +218,7 @@ rule stitch:
         corners="results/{scene}/stitched/corners.parquet",
     log:
         "results/{scene}/logs/stitch.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -209,7 +228,8 @@ rule stitch:
         reach=lambda w: plan(w).reach,
         seams=lambda w: plan(w).seam_rule,
         folders=lambda w: [
-            f"results/{w.scene}/blocks/{b.name}/{source(w)}" for b in plan(w).blocks
+            f"results/{w.scene}/blocks/{b.name}/{source(w)}"
+            for b in plan(w).having("feed")
         ],
         corners=lambda w: ["--without-corners"] if measured(plan(w)) else [],
     shell:

@@ -21,10 +21,11 @@ rule geopackage:
     params:
         signature=signature("solids"),
         tiling=lambda w: plan(w).tiling,
+        blocks=failed,
     shell:
         "python -m kibs_steps.publish.geopackage --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --sections {input.sections:q}"
-        " --solids {input.solids:q} --corners {input.corners:q} --models {input.models:q}"
+        " --solids {input.solids:q} --corners {input.corners:q} --models {input.models:q} {params.blocks:q}"
         " --out {output:q} > {log:q} 2>&1"
 
 
@@ -103,7 +104,7 @@ rule preview:
     """preview.png: the raster with the roof sections found."""
     input:
         scene=given("results/{scene}/scene.json"),
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(plan(w).raster)),
         sections=given("results/{scene}/buildings.parquet"),
     output:
         "results/{scene}/preview.png",
@@ -125,7 +126,7 @@ rule glb:
     """city.glb: the city for 3D viewers."""
     input:
         scene=given("results/{scene}/scene.json"),
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(plan(w).raster)),
         dtm=given("results/{scene}/dtm.tif"),
         solids=given(blocks("solids.city.jsonl")),
         models=given(licensed),
@@ -239,7 +240,7 @@ rule viewer:
     """viewer.html: the city in a browser."""
     input:
         scene=given("results/{scene}/scene.json"),
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(plan(w).raster)),
         dtm=given("results/{scene}/dtm.tif"),
         solids=given(blocks("solids.city.jsonl")),
         models=given(licensed),
@@ -287,7 +288,9 @@ rule record:
     """run.json: versions, hashes, models and their licences, counts."""
     input:
         scene=given("results/{scene}/scene.json"),
-        sources=given(lambda w: [plan(w).raster, *plan(w).terrain_files]),
+        sources=given(
+            lambda w: [*sources.files(plan(w).raster), *plan(w).terrain_files]
+        ),
         models=given(licensed),
         sections=given("results/{scene}/buildings.parquet"),
         solids=given(blocks("solids.parquet")),
@@ -300,7 +303,9 @@ rule record:
     params:
         signature=signature("run"),
         settings=lambda w: json.dumps(plan(w).settings),
+        remote=lambda w: plan(w).remote,
+        blocks=failed,
     shell:
-        "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} --models {input.models:q}"
+        "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} {params.remote:q} --models {input.models:q}"
         " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"
-        " --out {output:q} > {log:q} 2>&1"
+        " {params.blocks:q} --out {output:q} > {log:q} 2>&1"

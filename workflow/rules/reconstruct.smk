@@ -40,7 +40,7 @@ rule surface:
     """Bring the user's surface model into the scene's CRS."""
     input:
         scene=given("results/{scene}/scene.json"),
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(plan(w).raster)),
         dsm=given(lambda w: plan(w).settings["dsm"]),
     output:
         "results/{scene}/surface.tif",
@@ -81,6 +81,7 @@ rule planes:
         filed="results/{scene}/blocks/{block}/filed_corners.parquet",
     log:
         "results/{scene}/logs/planes/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -108,6 +109,7 @@ rule ground:
         "results/{scene}/blocks/{block}/ground.parquet",
     log:
         "results/{scene}/logs/ground/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -131,6 +133,7 @@ rule buildings:
         "results/{scene}/buildings.parquet",
     log:
         "results/{scene}/logs/buildings.log",
+    retries: 1
     conda:
         RUN
     params:
@@ -144,7 +147,7 @@ rule buildings:
 
 
 given = inputs(
-    "solids",
+    "solids_of_block",
     "results/{scene}/blocks/{block}/solids.city.jsonl",
     "results/{scene}/blocks/{block}/solids.parquet",
 )
@@ -161,10 +164,11 @@ rule solids:
         attributes="results/{scene}/blocks/{block}/solids.parquet",
     log:
         "results/{scene}/logs/solids/{block}.log",
+    retries: 1
     conda:
         RUN
     params:
-        signature=signature("solids"),
+        signature=signature("solids_of_block"),
         options=options("lod_label"),
     shell:
         "python -m kibs_steps.solids --scene {input.scene:q} --buildings {input.buildings:q} --name {wildcards.block}"

@@ -1,0 +1,116 @@
+"""Inputs: what a user gave, looked at before any work, by headers alone.
+
+`check` runs each time the workflow is read, so that a run of hours does not end at a layer without heights; what needs the
+data themselves (`scene`, `truth`) follows in the first jobs. docs/inputs.md lists every bad input with the message it gets.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kibs_steps.errors import KibsError
+
+if TYPE_CHECKING:
+    from kibs_steps.plan import Plan
+
+
+class ResultsUnwritable(KibsError):
+    """The place where results go does not take them."""
+
+
+class FootprintsUnusable(KibsError):
+    """Footprints that cannot be read or placed."""
+
+
+def check(plan: Plan, results: Path) -> list[str]:
+    """Refuse what a scene cannot be made from; returns what is doubtful. Raises the named errors of docs/inputs.md."""
+    import pyproj
+
+    from kibs_steps import dtm, imagery, scene
+
+    writable(results / plan.name)
+    settings = plan.settings
+    if settings.get("simulate") is not None:
+        return []
+    grid = scene.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))
+    for name, lowest in (("view", 20.0), ("sun", 5.0)):
+        scene.direction(settings.get(f"{name}_azimuth"), settings.get(f"{name}_elevation"), grid, name, lowest)
+    scene.check_vertical(settings.get("vertical_crs"))
+    doubts = []
+    with imagery.opened(plan.raster) as source:
+        imagery.complete(source)
+        doubts.append(imagery.colour_bands(source, bands_of(settings))[1])
+        footprint = imagery.outline(source, pyproj.CRS.from_user_input(grid.crs))
+    doubts += dtm.check(plan.dtm, grid, footprint, settings.get("vertical_crs"))
+    if plan.truth:
+        check_truth(plan.truth, settings["truth_frame"], grid)
+    if settings.get("footprints"):
+        check_footprints(settings["footprints"])
+    return [doubt for doubt in doubts if doubt]
+
+
+def bands_of(settings: dict[str, Any]) -> tuple[int, ...] | None:
+    """The setting `bands`, a list or text like "5,3,2", as numbers."""
+    bands = settings.get("bands")
+    return None if bands is None else tuple(int(b) for b in (bands.split(",") if isinstance(bands, str) else bands))
+
+
+def writable(folder: Path) -> None:
+    """Refuse a folder for results that cannot be made or written to."""
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise ResultsUnwritable(f"{folder} cannot be made: {there} is a file; move it away, or start in another folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ResultsUnwritable(f"{folder} cannot be written: {there} is not yours; start in a folder that is")
+
+
+def check_truth(path: str, frame: str, grid: Any) -> None:
+    """Look at a truth layer's header; raises what `truth` raises."""
+    import pyogrio
+    import pyproj
+
+    from kibs_steps import truth
+
+    name, facts = truth.layer_of(path, frame)
+    if facts["features"] == 0:
+        raise truth.NoPolygons(f"truth {path}, layer {name}, has no polygons: draw some, or leave truth out")
+    kind = facts["geometry_type"] or ""
+    if "Polygon" in kind and not any(mark in kind for mark in (" Z", "3D", "2.5D")):
+        raise truth.NoHeights(
+            f"truth {path}, layer {name}, holds {kind}s without z: every outline must be a PolygonZ with a height at each corner"
+        )
+    bounds = facts.get("total_bounds")
+    if bounds is None or not all(map(_finite, bounds)):
+        bounds = pyogrio.read_bounds(path, layer=name)[1]
+        bounds = (*bounds[:2].min(axis=1), *bounds[2:].max(axis=1))
+    move = pyproj.Transformer.from_crs(pyproj.CRS.from_user_input(facts["crs"]).to_2d(), grid.crs, always_xy=True)
+    left, bottom, right, top = move.transform_bounds(*bounds)
+    if left > grid.bounds[2] + truth.AROUND or right < grid.bounds[0] - truth.AROUND or (
+        bottom > grid.bounds[3] + truth.AROUND or top < grid.bounds[1] - truth.AROUND
+    ):  # fmt: skip
+        raise truth.NoOverlap(
+            f"truth {path}, layer {name} ({facts['crs']}) lies at {left:.0f} {bottom:.0f} {right:.0f} {top:.0f} in {grid.crs}, "
+            "outside the scene: check the layer's CRS and the raster it belongs to"
+        )
+
+
+def _finite(value: float) -> bool:
+    return value == value and abs(value) != float("inf")
+
+
+def check_footprints(path: str) -> None:
+    """Look at a footprint layer's header."""
+    import pyogrio
+
+    try:
+        facts = pyogrio.read_info(path)
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise FootprintsUnusable(f"footprints {path} cannot be read ({error}): give a GeoPackage or GeoJSON") from error
+    if facts["crs"] is None:
+        raise FootprintsUnusable(f"footprints {path} says no CRS: assign one")
+    if facts["features"] == 0:
+        raise FootprintsUnusable(f"footprints {path} holds no polygons: give a layer of building outlines")
