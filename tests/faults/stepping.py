@@ -48,11 +48,11 @@ MODULES = [
 ]
 
 CALLER = """#!{python} -IS
-import json, os, socket, sys
+import json, os, shlex, socket, sys
 if sys.argv[1:2] != ["-m"]:
     os.execv({python!r}, sys.argv)
 with open({folder!r} + "/seen", "a") as seen:
-    seen.write(" ".join(sys.argv[2:]) + "\\n")
+    seen.write(shlex.join(sys.argv[2:]) + "\\n")
 caller = socket.socket(socket.AF_UNIX)
 caller.connect({folder!r} + "/socket")
 socket.send_fds(caller, [json.dumps([sys.argv[2:], os.getcwd()]).encode()], [1, 2])
