@@ -13,9 +13,8 @@ import argparse
 
 import numpy as np
 
-from kibs_steps import cli, raster, scene, sections
+from kibs_steps import cli, raster, scene, sections, store
 from kibs_steps.grid import Tiling
-from kibs_steps.models import runtime
 
 Bands = list[int | None]
 
@@ -53,7 +52,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", required=True, help="blended.tif")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
-    contract = runtime.from_record(args.model, "corners").contract
+    contract = store.read_json(args.model)["contract"]
     tiling = Tiling(contract["tile"], args.margin, args.block)
     block = tiling.block_of(args.name)
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)

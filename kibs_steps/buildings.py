@@ -5,9 +5,11 @@ touch exactly: their planes are fitted apart, and each outline was moved by its 
 strip of up to |k·n|·Δz (k the lean, n the edge's normal) was hidden in the image and is missing. A **building** is a connected
 group of sections that share edges, split where the step along the edge is higher than 3 m, and between footprints if given.
 
-In: all blocks' `ground.parquet`. Out: `buildings.parquet`, the same rows with `building_id`, the smallest `section_id` of the
-group, and `block`: the block whose core holds that section's id pixel, so a building is never cut. Blocks and the
-order of sections do not matter.
+Buildings that share edges all the same (across a high step, or a footprint's line) form a **cluster**: they share party walls.
+
+In: all blocks' `ground.parquet`. Out: `buildings.parquet`, the same rows with `building_id` and `cluster_id`, the smallest
+`section_id` of each, and `block`: the block whose core holds the cluster's id pixel, so neither is ever cut. Blocks and
+the order of sections do not matter.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ import shapely
 from kibs_steps import cli, scene, store
 from kibs_steps.grid import Tiling
 from kibs_steps.inputs import FootprintsUnusable
+from kibs_steps.planes import middle_of
 from kibs_steps.stitch import groups, owner_blocks
+from kibs_steps.view import Lean
 
 SHARED = 0.5  # m, shortest shared edge
 APART = 1.0  # m, how far apart (or over each other) outlines that share an edge may run
@@ -30,36 +34,44 @@ SLACK = 0.5  # m, the same where a step explains the gap
 STEP = 3.0  # m, higher steps divide buildings
 FACING = -0.7  # cosine between the directions of two outlines that face each other
 OVERLAP = 0.25  # m², sections over each other by as much are together
-AT_ONCE = 2_000_000  # edge pairs held in memory
+AT_ONCE = 250_000  # edge pairs held in memory
 
 
 def buildings(
     ids: np.ndarray,
     outlines: np.ndarray,
     planes: np.ndarray,
-    lean: tuple[float, float],
+    lean: Lean,
     footprint: np.ndarray | None = None,
-) -> np.ndarray:
-    """Building id (n,) of each section.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Building id (n,) and cluster id (n,) of each section.
 
     `ids` (n,) section ids; `outlines` (n,) polygons, map frame (m); `planes` (n, 5) as a, b, c, x0, y0 of
-    z = a(x−x0) + b(y−y0) + c; `lean` m per m; `footprint` (n,) number of the footprint each section stands in, −1 none.
+    z = a(x−x0) + b(y−y0) + c; `lean` of the view, one or (n, 2); `footprint` (n,) number of the
+    footprint each section stands in, −1 none.
     """
     order = np.argsort(ids, kind="stable")
     flat = shapely.force_2d(outlines[order])
     flat = np.where(shapely.is_missing(flat), shapely.Polygon(), flat)
     whole = shapely.make_valid(flat)
+    lean = np.broadcast_to(np.asarray(lean, float), (len(ids), 2))[order]
     reach = max(APART, hidden(lean))
     pairs = shapely.STRtree(whole).query(whole, predicate="dwithin", distance=reach).T
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]
-    if footprint is not None:
-        pairs = pairs[footprint[order][pairs[:, 0]] == footprint[order][pairs[:, 1]]]
     length, step = shared_edges(flat, planes[order], pairs, lean)
     long = length >= SHARED
     together = long & (step <= STEP)
     rest = np.flatnonzero(~long)
     together[rest] = _overlapping(whole, planes[order], pairs[rest])
-    group = groups(len(ids), pairs[together])
+    touching = long | together
+    if footprint is not None:
+        together &= footprint[order][pairs[:, 0]] == footprint[order][pairs[:, 1]]
+    return _named(ids, order, pairs[together]), _named(ids, order, pairs[touching])
+
+
+def _named(ids: np.ndarray, order: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """For each section the smallest id of those it is connected to; `pairs` (m, 2) number the sections in `order`."""
+    group = groups(len(ids), pairs)
     smallest = np.full(group.max(initial=-1) + 1, np.iinfo(np.int64).max)
     np.minimum.at(smallest, group, ids[order])
     result = np.empty(len(ids), np.int64)
@@ -67,15 +79,18 @@ def buildings(
     return result
 
 
-def hidden(lean: tuple[float, float]) -> float:
-    """Widest strip (m) of a building that its own steps can hide in an image of that lean."""
-    return SLACK + float(np.hypot(*lean)) * STEP
+def hidden(lean: Lean) -> float:
+    """Widest strip (m) of a building that its own steps can hide in an image of that lean (of these leans)."""
+    return SLACK + float(np.hypot(*np.asarray(lean, float).T).max(initial=0.0)) * STEP
 
 
 def shared_edges(
-    outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray, lean: tuple[float, float]
+    outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray, lean: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Length (m) of the edge that each pair (m, 2) of sections shares, and the mean height of the step along it (m)."""
+    """Length (m) of the edge that each pair (m.
+
+    2) of sections shares, and the mean height of the step along it (m); `lean` (n, 2).
+    """
     parts, section = shapely.get_parts(outlines, return_index=True)
     rings, part = shapely.get_rings(shapely.orient_polygons(parts), return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)
@@ -109,7 +124,7 @@ def _facing(
     planes: np.ndarray,
     i: np.ndarray,
     j: np.ndarray,
-    lean: tuple[float, float],
+    lean: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far (m) edges i and j run along each other, and the step (m) there; 0 m where they do not."""
     span = end - start
@@ -127,7 +142,7 @@ def _facing(
     here, there = start[i] + middle[:, None] * u[i], start[j] + t[:, None] * span[j]
     step = np.abs(_heights(planes[of[i]], here) - _heights(planes[of[j]], there))
     normal = np.stack([u[i][:, 1], -u[i][:, 0]], axis=1)
-    reach = SLACK + np.abs(normal @ np.asarray(lean, float)) * np.minimum(step, STEP)
+    reach = SLACK + np.abs((normal * lean[of[i]]).sum(axis=1)) * np.minimum(step, STEP)
     near = np.abs(((there - here) * normal).sum(axis=1)) <= np.maximum(APART, reach)
     return np.where(near, along, 0.0), step
 
@@ -196,10 +211,12 @@ def main(argv: list[str] | None = None) -> None:
     outlines = shapely.from_wkb(table["outline_map"].to_numpy(zero_copy_only=False), on_invalid="ignore")
     planes = np.stack([table[name].to_numpy() for name in ("plane_a", "plane_b", "plane_c", "x0", "y0")], axis=1)
     footprint = standing_in(outlines, read_footprints(args.footprints, facts.grid.crs)) if args.footprints else None
-    building = buildings(table["section_id"].to_numpy(), outlines, planes, facts.lean, footprint)
-    table = table.append_column("building_id", pa.array(building))
+    pixels = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False), on_invalid="ignore")
+    lean = facts.leans(middle_of(pixels, facts))
+    building, cluster = buildings(table["section_id"].to_numpy(), outlines, planes, lean, footprint)
+    table = table.append_column("building_id", pa.array(building)).append_column("cluster_id", pa.array(cluster))
     table = table.sort_by([("building_id", "ascending"), ("section_id", "ascending")])
-    block_of = owner_blocks(table["building_id"].to_numpy(), facts.grid, tiling)
+    block_of = owner_blocks(table["cluster_id"].to_numpy(), facts.grid, tiling)
     by_block = {}
     for block in tiling.blocks(facts.grid.width, facts.grid.height):
         mine = np.flatnonzero((block_of == (block.row, block.col)).all(axis=1))

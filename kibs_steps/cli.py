@@ -10,11 +10,14 @@ from typing import Any
 from kibs_steps.errors import AGAIN, KibsError
 
 
-def run(main: Callable[[], None]) -> None:
+def run(main: Callable[[], None], pandas: bool = True) -> None:
     """Call `main`; whatever it raises ends the process with code 1 and a last line on stderr that says what to do.
 
-    A mistake of ours shows its traceback above that line.
+    A mistake of ours shows its traceback above that line. `pandas` False: the step uses none, and shall not wait half a second
+    for pyarrow to import it.
     """
+    if not pandas:
+        sys.meta_path.insert(0, _NoPandas)
     try:
         main()
     except Exception as error:
@@ -46,3 +49,12 @@ def told(error: Exception) -> str | None:
     if isinstance(error, PermissionError):
         return f"{error.filename} may not be read or written by this user: change its permissions, then {AGAIN}"
     return None
+
+
+class _NoPandas:
+    """An importer that has no pandas: pyarrow looks for it, to know a Series when it is given one, and does without."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError("this step uses no pandas", name=name)

@@ -9,13 +9,16 @@ In: `blended.tif`, the model. Out: `corners.parquet`: tile, position (px, image 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 
 from kibs_steps import cli, raster, scene, sections, store
 from kibs_steps.grid import Tile, Tiling
-from kibs_steps.models import heads, runtime
+
+if TYPE_CHECKING:
+    from kibs_steps.models import heads
 
 SEAM = 1.5  # px: further than the position error of one corner seen by two tiles
 
@@ -51,6 +54,8 @@ def of_tile(found: heads.Corners, tile: Tile, tiling: Tiling) -> pa.Table:
 
 def main(argv: list[str] | None = None) -> None:
     """Find the roof corners of one block and their heights."""
+    from kibs_steps.models import heads, runtime
+
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.corners", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
     parser.add_argument("--blended", required=True, help="blended.tif of the block")
@@ -58,15 +63,18 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--name", required=True, help="block name")
     parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    runtime.add_options(parser)
     parser.add_argument("--out", required=True, help="corners.parquet")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     model = runtime.from_record(args.model, "corners")
     tiling = Tiling(model.contract["tile"], args.margin, args.block)
-    tiles = tiling.tiles(tiling.block_of(args.name), facts.grid.width, facts.grid.height)
+    block = tiling.block_of(args.name)
+    tiles = tiling.tiles(block, facts.grid.width, facts.grid.height)
     images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
-    geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
-    network = runtime.open_network(model, geometry)
+    seen = facts.view_of(tiling.block_core(block, facts.grid.width, facts.grid.height))
+    geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
+    network = runtime.open_network(model, geometry, args.provider, args.threads)
     tables = [CORNERS.empty_table()]
     for tile in tiles:
         image = images[tile.row, tile.col]
@@ -75,4 +83,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -40,6 +40,11 @@ def polygon(face: Face) -> shapely.Polygon:
     return shapely.Polygon(exterior, holes)
 
 
+def shapes_of(faces: list[Face]) -> list[shapely.Geometry]:
+    """Valid areas (m from the origin) of faces; a face that touches itself in a point becomes several parts."""
+    return list(shapely.make_valid([polygon(face) for face in faces]))
+
+
 def rings_of(cell: shapely.Polygon) -> list[Ring]:
     """A polygon's rings as mm points."""
     return [

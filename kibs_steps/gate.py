@@ -51,13 +51,21 @@ def newell(ring: Sequence[Point3]) -> np.ndarray:
 
 def volume(faces: Sequence[Rings]) -> float:
     """Signed volume (mm³) inside the faces: positive when they face outward."""
-    origin = np.asarray(faces[0][0][0], float)
-    total = 0.0
-    for rings in faces:
-        for ring in rings:
-            p = np.asarray(ring, float) - origin
-            total += np.cross(p, np.roll(p, -1, axis=0)).sum(axis=0) @ p[0] / 6
-    return total
+    every = [ring for rings in faces for ring in rings]
+    first = np.array([ring[0] for ring in every], float) - every[0][0]
+    return float((area_vectors(every) * first).sum()) / 3
+
+
+def area_vectors(rings: Sequence[Sequence[Point3]]) -> np.ndarray:
+    """Area vectors (n, 3) of rings: `newell` of each, all at once."""
+    count = np.array([len(ring) for ring in rings])
+    start = np.cumsum(count) - count
+    p = np.array([point for ring in rings for point in ring], float)
+    p -= np.repeat(p[start], count, axis=0)
+    after = np.arange(len(p)) + 1
+    after[start + count - 1] = start
+    (x, y, z), (u, v, w) = p.T, p[after].T
+    return np.add.reduceat(np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1), start) / 2
 
 
 def check(faces: Sequence[Rings]) -> list[Problem]:
@@ -100,9 +108,10 @@ def _near(faces: Sequence[Rings]) -> list[Problem]:
 def _lay_flat(faces: Sequence[Rings]) -> tuple[list[Flat], list[Problem]]:
     """Every face laid flat by dropping the coordinate its normal is longest in, so that coordinates stay integers."""
     flats, problems = [], []
-    for i, rings in enumerate(faces):
-        areas = [newell(ring) for ring in rings]
-        total = np.sum(areas, axis=0)
+    count = [len(rings) for rings in faces]
+    of_face = np.split(area_vectors([ring for rings in faces for ring in rings]), np.cumsum(count)[:-1])
+    for i, (rings, areas) in enumerate(zip(faces, of_face, strict=True)):
+        total = areas.sum(axis=0)
         length = np.linalg.norm(total)
         if length < 1.0:
             problems.append(Problem("degenerate", (i,), f"face {i} has no area"))

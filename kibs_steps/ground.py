@@ -17,9 +17,10 @@ import pyarrow as pa
 import shapely
 
 from kibs_steps import cli, scene, store, view
-from kibs_steps.planes import map_bounds
+from kibs_steps.planes import map_bounds, middle_of
 
 LEVEL = 3.0  # deg: below this a slope has no direction
+ANGLE_SIGMA = 0.3  # deg: how far the view at one place is from the mean angles of a whole image
 
 SECTIONS = pa.schema(
     [
@@ -44,6 +45,8 @@ SECTIONS = pa.schema(
         ("score", pa.float64()),
         ("area", pa.float64()),
         ("split", pa.int64()),
+        ("sigma_along", pa.float64()),
+        ("sigma_across", pa.float64()),
     ]
 )
 
@@ -63,7 +66,9 @@ def ground(planes: pa.Table, facts: scene.Scene, dtm: view.Surface) -> pa.Table:
     pixel, index = shapely.get_coordinates(outlines, return_index=True)
     seen = facts.grid.to_map(pixel)
     plane = view.Plane(*(column[name][index] for name in ("plane_a", "plane_b", "plane_c", "x0", "y0")))
-    where, z = view.ray_meets_plane(seen, plane, facts.lean, base)
+    middles = middle_of(outlines, facts)
+    lean = facts.leans(middles)
+    where, z = view.ray_meets_plane(seen, plane, lean[index], base)
     height = z - dtm(where)
     flat = shapely.force_3d(outlines)
     outline_seen = shapely.set_coordinates(flat.copy(), np.column_stack([seen, height]))
@@ -74,6 +79,8 @@ def ground(planes: pa.Table, facts: scene.Scene, dtm: view.Surface) -> pa.Table:
     np.maximum.at(high, index, height)
     centre = shapely.get_coordinates(shapely.centroid(outline_map)) if n else np.zeros((0, 2))
     middle = view.Plane(*column.values()).at(centre) - dtm(centre)
+    elevation = np.array([v.elevation if v else np.nan for v in facts.views(middles)], float)
+    along, across = view.position_sigma(middle, planes["height_sigma"].to_numpy(), elevation, ANGLE_SIGMA)
     slope, azimuth = slope_azimuth(column["plane_a"], column["plane_b"], scene.convergence(facts.grid))
     values = {
         "outline_seen": shapely.to_wkb(outline_seen, output_dimension=3),
@@ -84,6 +91,8 @@ def ground(planes: pa.Table, facts: scene.Scene, dtm: view.Surface) -> pa.Table:
         "slope": slope,
         "azimuth": pa.array(azimuth, from_pandas=True),
         "area": shapely.area(outline_map),
+        "sigma_along": pa.array(along, from_pandas=True),
+        "sigma_across": pa.array(across, from_pandas=True),
     }
     return pa.table(
         [values[f.name] if f.name in values else planes[f.name] for f in SECTIONS], names=SECTIONS.names
@@ -103,4 +112,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

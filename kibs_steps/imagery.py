@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kibs_steps import sources
 from kibs_steps.errors import KibsError
 
 if TYPE_CHECKING:
@@ -59,18 +60,19 @@ def opened(path: str | Path) -> Iterator[rasterio.DatasetReader]:
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
-    with warnings.catch_warnings():
+    remote = sources.is_remote(str(path))
+    settings = {"GDAL_CACHEMAX": CACHE, **(sources.GDAL if remote else {})}
+    with rasterio.Env(**settings), warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             source = rasterio.open(path)
         except RasterioIOError as error:
-            local = "://" not in str(path) and not str(path).startswith("/vsi")
-            if local and not Path(path).exists():
+            if not remote and not Path(path).exists():
                 raise RasterMissing(f"raster {path} does not exist: check the path") from error
             raise NotARaster(
                 f"{path} cannot be read as a raster ({error}): give a GeoTIFF or another GDAL format"
             ) from error
-    with source, rasterio.Env(GDAL_CACHEMAX=CACHE):
+    with source, rasterio.Env(**settings):
         if not source.count:
             raise NotARaster(f"{path} holds no image of its own: name one of its subdatasets, {source.subdatasets[:3]}")
         yield source

@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps import fingerprint
+from kibs_steps import fingerprint, sources, tiled
 from kibs_steps import settings as user_settings
 from kibs_steps.grid import Block, Tiling
 from kibs_steps.models import contract, suite
@@ -33,7 +33,10 @@ DEFAULTS = {
     "truth_frame": "map",
     "truth_z": "absolute",
     "allow_angles": False,
+    "provider": "cpu",
+    "threads": 1,
     "lod_label": "2.0",
+    "drape": False,
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
 TASKS = {"two_stage": ("sections", "corners"), "single": ("both",)}
@@ -67,12 +70,21 @@ class Plan(NamedTuple):
 
     @property
     def terrain_files(self) -> list[str]:
-        """The terrain file, or nothing where the terrain is a number."""
+        """The terrain file, or nothing where the terrain is a number or remote."""
         try:
             float(self.dtm)
         except ValueError:
-            return [self.dtm]
+            return sources.files(self.dtm)
         return []
+
+    @property
+    def remote(self) -> list[str]:
+        """Raster and terrain that are read by URL."""
+        return [path for path in (self.raster, self.dtm) if sources.is_remote(path)]
+
+    def blocks_read(self, copy: str) -> str:
+        """The raster that blocks read: `copy` (a path) where the raster's own layout is too slow."""
+        return copy if self.settings.get("simulate") is None and tiled.needed(self.raster) else self.raster
 
     @property
     def seam_rule(self) -> str:
@@ -110,12 +122,13 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
+    settings = {**angles_of(settings), **settings}
     if settings["mode"] == "paper":
         settings = {**settings, **PAPER_MODE}
     models = models_for(settings, base)
     terms = models["sections"].contract
     # The paper's tiles overlap by p in all, ours by p on each side (PAPER, finding 6).
-    margin = terms["margin"] // 2 if settings["mode"] == "paper" else terms["margin"]
+    margin = max(terms["margin"] // 2, 1) if settings["mode"] == "paper" else terms["margin"]
     tiling = Tiling(terms["tile"], margin, int(settings["block"]))
     cache = results / ".fingerprints.json"
     folder = results / name
@@ -147,9 +160,9 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
             raise BadConfig(
                 f"scene {name}: which terrain? Give dtm=FILE, or dtm=NUMBER for flat ground at that height (m)"
             )
-        dtm = str(dtm)
+        raster, dtm = sources.place(raster), sources.place(str(dtm))
         width, height = grid_size(raster, terms["gsd"], settings.get("aoi"))
-        source = [fingerprint.of_file(f, cache) if Path(f).is_file() else f for f in (raster, dtm)]
+        source = [sources.content(f, cache) for f in (raster, dtm)]
         truth_source = fingerprint.of_file(truth, cache) if truth and Path(truth).is_file() else truth
     if settings["feed"] == "truth" and not truth:
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
@@ -172,6 +185,15 @@ def leaving_out(name: str, text: str, blocks: list[Block]) -> dict[str, str]:
                 raise BadConfig(f"leave_out: {item}: the scene has blocks {blocks[0].name} to {blocks[-1].name}")
             found[block] = step
     return dict(sorted(found.items()))
+
+
+def angles_of(settings: dict[str, Any]) -> dict[str, float]:
+    """The angles that the scene's `metadata` tells, by their keys; what is set itself comes before them."""
+    if not settings.get("metadata"):
+        return {}
+    from kibs_steps import metadata
+
+    return {key: value for key, value in metadata.read(settings["metadata"])._asdict().items() if value is not None}
 
 
 def direction(settings: dict[str, Any], name: str) -> dict[str, float] | None:
@@ -247,7 +269,7 @@ def signatures(
         value = settings.get(key)
         return fingerprint.of_file(value, cache) if value and Path(value).is_file() else value
 
-    angles = some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation")
+    angles = [some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"), content("regions")]
     seen = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
     s = {"source": h(version("kibs-steps"), source)}
     s["scene"] = h(
@@ -261,19 +283,29 @@ def signatures(
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
-    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"])
+    inference = some("provider", "threads")  # sums in another order differ in their last bits
+    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"], inference)
     s["blend"] = h(s["sections"], models["corners"].sha256)
-    s["corners"] = h(s["blend"], seen["corners"])
+    s["corners"] = h(s["blend"], seen["corners"], inference)
     s["single"] = h(s["sections"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.
-    detected = s["single" if settings["method"] == "single" else "corners"]
+    detected = s["single" if settings["method"] == "single" else "sections" if settings.get("dsm") else "corners"]
     detected = s["feed"] if settings["feed"] == "truth" else detected
     s["stitch"] = h(detected, models["corners"].sha256, settings["mode"], without(*DETECTING))
-    s["planes"] = h(s["stitch"], s["scene"], models["corners"].sha256, settings["planes"])
+    s["edited"] = h(s["stitch"], s["scene"], content("sections")) if settings.get("sections") else s["stitch"]
+    s["surface"] = h(s["scene"], content("dsm"))
+    s["planes"] = h(
+        s["edited"],
+        s["scene"],
+        models["corners"].sha256,
+        settings["planes"],
+        s["surface"] if settings.get("dsm") else None,
+    )
     s["buildings"] = h(s["planes"], content("footprints"), without(*STANDING))
     s["solids_of_block"] = h(s["buildings"], settings["lod_label"])
     s["solids"] = h(s["solids_of_block"], without("solids"))
     s["evaluate"] = h(s["planes"], s["truth"], without(*STANDING))
+    s["glb"] = h(s["solids"], settings["drape"])
     s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
     return s

@@ -14,7 +14,7 @@ In: stitched sections and corners, DTM, view. Out: `planes.parquet`, `filed_corn
 from __future__ import annotations
 
 import argparse
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -246,28 +246,27 @@ def planes(
     """
     outlines = shapely.from_wkb(sections["outline"].to_numpy(zero_copy_only=False))
     pixel = np.stack([corners["col"].to_numpy(), corners["row"].to_numpy()], axis=1)
-    height = corners["height"].to_numpy()
     base = facts.projected_on(dtm)
-    where, z = view.ground_position(facts.grid.to_map(pixel), height, dtm, facts.lean, base)
-    points = Points(*pixel.T, where[:, 0], where[:, 1], z, height, corners["sigma"].to_numpy())
     shared = SHARED if rule == "robust" else 0.0
     section, corner = file_corners(
         outlines, pixel, corners["owner"].to_numpy(), sections["owner"].to_numpy(), reach, shared
     )
+    centre = middle_of(outlines, facts)
+    lean = facts.leans(centre)
+    pixel, height = pixel[corner], corners["height"].to_numpy()[corner]
+    where, z = view.ground_position(facts.grid.to_map(pixel), height, dtm, lean[section], base)
+    points = Points(*pixel.T, where[:, 0], where[:, 1], z, height, corners["sigma"].to_numpy()[corner])
     area_px = shapely.area(outlines)
-    centre = (
-        facts.grid.to_map(shapely.get_coordinates(shapely.centroid(outlines))) if len(outlines) else np.zeros((0, 2))
-    )
     rows = []
     bounds = np.searchsorted(section, np.arange(len(outlines) + 1))
+    parts = [points.take(np.arange(first, end)) for first, end in pairwise(bounds)]
+    typical = np.array([np.median(p.height) if len(p.z) else fallback[0] for p in parts])
+    middle, _ = view.ground_position(centre, typical, dtm, lean, base)
+    ground = dtm(middle)
     edge, void = sections["edge"].to_pylist(), sections["void"].to_pylist()
-    for i in range(len(outlines)):
-        mine = points.take(corner[bounds[i] : bounds[i + 1]])
-        typical = float(np.median(mine.height)) if len(mine.z) else fallback[0]
-        middle, _ = view.ground_position(centre[i : i + 1], np.array([typical]), dtm, facts.lean, base)
-        ground = float(dtm(middle)[0])
-        found = fit(mine, area_px[i], middle[0], ground, fallback, rule)
-        found = checked(found, mine, area_px[i], ground, middle[0], edge[i], void[i])
+    for i, mine in enumerate(parts):
+        found = fit(mine, area_px[i], middle[i], ground[i], fallback, rule)
+        found = checked(found, mine, area_px[i], float(ground[i]), middle[i], edge[i], void[i])
         rows.append([*found.plane, found.sigma, len(mine.z), found.status, found.reason])
     table = sections.select(["section_id", "outline", "score", "split"])
     for k, (name, kind) in enumerate(PLANE_FIELDS):
@@ -275,13 +274,13 @@ def planes(
     filed = pa.table(
         {
             "section_id": sections["section_id"].to_numpy()[section],
-            "x": points.x[corner],
-            "y": points.y[corner],
-            "z": points.z[corner],
-            "col": pixel[corner, 0],
-            "row": pixel[corner, 1],
-            "height": height[corner],
-            "sigma": points.sigma[corner],
+            "x": points.x,
+            "y": points.y,
+            "z": points.z,
+            "col": points.col,
+            "row": points.row,
+            "height": points.height,
+            "sigma": points.sigma,
             "score": corners["score"].to_numpy()[corner],
         }
     )
@@ -298,6 +297,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--model", required=True, help="models/corners.json: mean height where no corner is found")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--rule", choices=["robust", "paper"], default="robust")
+    parser.add_argument("--surface", help="surface.tif: heights come from there, not from corners")
     parser.add_argument("--planes", required=True, help="out: planes.parquet")
     parser.add_argument("--filed", required=True, help="out: filed_corners.parquet")
     args = parser.parse_args(argv)
@@ -306,9 +306,20 @@ def main(argv: list[str] | None = None) -> None:
     sections, corners = (store.read_table(f, block=args.name) for f in (args.sections, args.corners))
     dtm = facts.terrain(map_bounds(sections, facts))
     fallback = (heights["fallback"], heights.get("fallback_sigma", 3.0))
+    if args.surface:
+        from kibs_steps import surface
+
+        sections, corners = surface.under(sections, facts, args.surface, dtm)
     table, filed = planes(sections, corners, facts, dtm, fallback, args.reach, args.rule)
     store.write_table(args.planes, table)
     store.write_table(args.filed, filed)
+
+
+def middle_of(outlines: np.ndarray, facts: scene.Scene) -> np.ndarray:
+    """Middles (n, 2; image map frame, m) of outlines (px): a section is seen from the direction that holds there."""
+    if not len(outlines):
+        return np.zeros((0, 2))
+    return facts.grid.to_map(shapely.get_coordinates(shapely.centroid(outlines)))
 
 
 def map_bounds(sections: pa.Table, facts: scene.Scene) -> tuple[float, float, float, float]:
@@ -322,4 +333,4 @@ def map_bounds(sections: pa.Table, facts: scene.Scene) -> tuple[float, float, fl
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

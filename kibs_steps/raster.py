@@ -14,7 +14,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
 from kibs_steps import store, sums
 
-FORMAT = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate", "zlevel": 1}
+FORMAT = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "zstd", "zstd_level": 1}
 
 
 def write(path: str | Path, image: np.ndarray, crs: str | None = None, transform: Affine | None = None) -> None:

@@ -16,12 +16,13 @@ import numpy as np
 from kibs_steps import cli, store, terrain
 from kibs_steps import view as geometry
 from kibs_steps.errors import KibsError
-from kibs_steps.grid import Grid
+from kibs_steps.grid import Grid, Window
 from kibs_steps.view import Surface
 
 if TYPE_CHECKING:
     import pyproj
     import rasterio
+    import shapely
 
 COARSEST = 1.6  # times the model's GSD
 SAME_GSD = 0.005  # a raster whose GSD differs less from the model's is used as it is
@@ -44,6 +45,10 @@ class VerticalCrsUnusable(KibsError):
     """A vertical CRS that is none."""
 
 
+class RegionsUnusable(KibsError):
+    """A layer of regions that does not say from where each was seen."""
+
+
 class Direction(NamedTuple):
     """A direction to the satellite or the sun: azimuth and elevation (deg), and its lean (m/m, grid axes east, north)."""
 
@@ -52,10 +57,18 @@ class Direction(NamedTuple):
     lean: tuple[float, float]
 
 
+class Region(NamedTuple):
+    """A part of the image (polygon, image map frame, m) that was seen from another direction, as in an aerial mosaic."""
+
+    outline: shapely.Geometry
+    view: Direction
+
+
 class Scene(NamedTuple):
     """What every later step needs to know; `view` and `sun` are None when unknown.
 
-    `stretch` is (low, high, gamma) per band, `nodata` the value that marks missing data in all bands
+    `regions` have a view of their own; `view` holds outside them. `stretch` is (low, high, gamma) per band, `nodata` the value
+    that marks missing data in all bands
     (`imagery.stretch_of`, `imagery.nodata_of`).
     """
 
@@ -69,11 +82,33 @@ class Scene(NamedTuple):
     projection_height: float | None
     folder: Path
     nodata: float | None = None
+    regions: tuple[Region, ...] = ()
 
     @property
     def lean(self) -> tuple[float, float]:
         """Lean of the view, m per m of height; (0, 0) when the view is unknown: nothing is moved then."""
         return self.view.lean if self.view else (0.0, 0.0)
+
+    def views(self, seen: np.ndarray) -> list[Direction | None]:
+        """From where the image shows the points seen at `seen` (n, 2 image map metres)."""
+        import shapely
+
+        found = [self.view] * len(seen)
+        for region in self.regions:
+            for k in np.flatnonzero(shapely.intersects_xy(region.outline, *np.asarray(seen, float).T)):
+                found[k] = region.view
+        return found
+
+    def view_of(self, part: Window) -> Direction | None:
+        """From where the image shows the middle of a window (px), for what takes one direction for all of it."""
+        middle = np.array([[part.col + part.width / 2, part.row + part.height / 2]])
+        return self.views(self.grid.to_map(middle))[0]
+
+    def leans(self, seen: np.ndarray) -> np.ndarray:
+        """Lean (n, 2) at points seen at `seen` (n, 2 image map metres); (0, 0) where the view is unknown."""
+        if not self.regions:
+            return np.broadcast_to(np.array(self.lean, float), (len(seen), 2))
+        return np.array([v.lean if v else (0.0, 0.0) for v in self.views(seen)], float).reshape(-1, 2)
 
     def terrain(self, bounds: tuple[float, float, float, float], margin: float = 200.0) -> terrain.Terrain:
         """The DTM around `bounds` (left, bottom, right, top, map metres)."""
@@ -104,6 +139,18 @@ def read(path: str | Path) -> Scene:
         projection_height=content["projection_height"],
         folder=Path(path).parent,
         nodata=None if nodata is None else float(nodata),
+        regions=_regions_in(content),
+    )
+
+
+def _regions_in(content: dict[str, Any]) -> tuple[Region, ...]:
+    if not content.get("regions"):
+        return ()
+    import shapely
+
+    return tuple(
+        Region(shapely.from_wkt(r["outline"]), Direction(r["azimuth"], r["elevation"], tuple(r["lean"])))
+        for r in content["regions"]
     )
 
 
@@ -251,6 +298,38 @@ def direction(
     return Direction(float(azimuth) % 360.0, float(elevation), lean)
 
 
+def read_regions(path: str | Path, grid: Grid) -> tuple[Region, ...]:
+    """The regions of a polygon layer with the columns `view_azimuth` and `view_elevation` (deg), in the layer's order.
+
+    Where polygons overlap the later one holds. Raises `RegionsUnusable`, `AnglesUnusable`.
+    """
+    import geopandas
+    import pyogrio
+    import shapely
+
+    try:
+        frame = geopandas.read_file(path)
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise RegionsUnusable(
+            f"regions {path} cannot be read as vector data ({error}): give a GeoPackage or GeoJSON"
+        ) from error
+    lacking = [name for name in ("view_azimuth", "view_elevation") if name not in frame.columns]
+    if lacking:
+        raise RegionsUnusable(
+            f"regions {path} lacks the column {' and '.join(lacking)}: each polygon needs both, in degrees"
+        )
+    if frame.crs is None:
+        raise RegionsUnusable(f"regions {path} has no CRS: assign it, or save it as GeoJSON in WGS 84")
+    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].to_crs(grid.crs)
+    if frame.empty:
+        raise RegionsUnusable(f"regions {path} holds no polygon: draw the parts of the image that share a view")
+    if frame[["view_azimuth", "view_elevation"]].isna().any(axis=None):
+        raise RegionsUnusable(f"regions {path}: a polygon has no view_azimuth or view_elevation: fill in both")
+    outlines = shapely.make_valid(shapely.force_2d(frame.geometry.to_numpy()))
+    angles = zip(frame["view_azimuth"].astype(float), frame["view_elevation"].astype(float), strict=True)
+    return tuple(Region(o, direction(*a, grid, "view")) for o, a in zip(outlines, angles, strict=True))
+
+
 def convergence(grid: Grid) -> float:
     """Meridian convergence (deg) at the grid's centre: the angle from true to grid north, clockwise."""
     import pyproj
@@ -319,6 +398,7 @@ def build(
     sun: tuple[float | None, float | None] = (None, None),
     projection_height: float | None = None,
     vertical_crs: str | None = None,
+    regions: str | Path | None = None,
 ) -> Scene:
     """Check everything and write `scene.json` and `dtm.tif` into `folder`; angles as (azimuth, elevation) in deg.
 
@@ -335,6 +415,7 @@ def build(
         "view": direction(*view, grid, "view"),
         "sun": direction(*sun, grid, "sun", lowest=5.0),
     }
+    parts = read_regions(regions, grid) if regions else ()
     check_vertical(vertical_crs)
     if projection_height is not None and not abs(projection_height) <= terrain_model.HIGHEST:
         raise terrain_model.DtmAbsurd(f"projection_height={projection_height} is no height on Earth: give metres")
@@ -359,6 +440,7 @@ def build(
         "projection_height": projection_height,
         "vertical_crs": vertical_crs,
         "dtm": ground,
+        "regions": [{"outline": shapely.to_wkt(r.outline, rounding_precision=3), **r.view._asdict()} for r in parts],
         "warnings": warnings,
     }
     store.write_json(Path(folder) / "scene.json", content)
@@ -405,6 +487,7 @@ def main(argv: list[str] | None = None) -> None:
         "--projection-height", type=float, help="m: the image was projected on this height, not the terrain"
     )
     parser.add_argument("--vertical-crs", help="CRS of absolute heights, as in EPSG:5773")
+    parser.add_argument("--regions", help="polygons with view_azimuth, view_elevation, where the view varies")
     args = parser.parse_args(argv)
     build(
         args.name,
@@ -418,6 +501,7 @@ def main(argv: list[str] | None = None) -> None:
         sun=(args.sun_azimuth, args.sun_elevation),
         projection_height=args.projection_height,
         vertical_crs=args.vertical_crs,
+        regions=args.regions,
     )
 
 

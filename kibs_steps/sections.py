@@ -12,14 +12,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
 from kibs_steps import cli, raster, scene, store
 from kibs_steps.grid import Block, Grid, Tile, Tiling, Window
-from kibs_steps.models import heads, runtime
+
+if TYPE_CHECKING:
+    from kibs_steps.models import heads, runtime
 
 MIN_STRIP_IOU = 0.3  # two views of one section share most of the strip; a neighbour's rim shares a pixel line
 SIDES = ("north", "south", "west", "east")
@@ -108,6 +110,8 @@ def detect(
 
     Tiles without data are not run. Labels are numbered through the block, tile after tile.
     """
+    from kibs_steps.models import heads
+
     views, used = [], 0
     for tile, image, data in tile_images(rgb, valid, tiling, block, grid):
         seen = core_of(data, tile, tiling.margin).any()
@@ -191,6 +195,7 @@ def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -
         inside = core_of(view.labels, view.tile, p)
         outlines = pixel_outlines(inside, view.tile.core)
         full = np.bincount(view.labels.ravel(), minlength=1)
+        own = np.bincount(inside.ravel(), minlength=len(full))
         place = window_in_block(view.tile.core, core, p)
         blank = ~valid[place.row : place.row + place.height, place.col : place.col + place.width]
         near_blank = set(np.unique(inside[grown(blank)]).tolist()) if blank.any() else set()
@@ -203,7 +208,7 @@ def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -
                     "tile_row": view.tile.row,
                     "tile_col": view.tile.col,
                     "score": float(view.scores[label - first]) if label - first < len(view.scores) else 0.0,
-                    "core_area": int((inside == label).sum()),
+                    "core_area": int(own[label]),
                     "full_area": int(full[label]),
                     "void": label in near_blank,
                     "outline": outline,
@@ -267,6 +272,8 @@ def write(
 
 def main(argv: list[str] | None = None) -> None:
     """Find the roof sections of one block."""
+    from kibs_steps.models import runtime
+
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.sections", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
     parser.add_argument("--tiles", required=True, help="tiles.tif of the block")
@@ -274,6 +281,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--name", required=True, help="block name")
     parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    runtime.add_options(parser)
     parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--labels", required=True, help="out: sections.tif")
     parser.add_argument("--pieces", required=True, help="out: pieces.parquet")
@@ -287,11 +295,12 @@ def main(argv: list[str] | None = None) -> None:
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
-    geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
-    network = runtime.open_network(model, geometry)
+    seen = facts.view_of(core)
+    geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
+    network = runtime.open_network(model, geometry, args.provider, args.threads)
     views = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
     write(views, valid, tiling, core, args.seam_rule, args)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -50,6 +50,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--name", required=True, help="block name")
     parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    runtime.add_options(parser)
     parser.add_argument(
         "--seam-rule", choices=sections.SEAM_RULES, default="overlap", help="which pieces are one section"
     )
@@ -67,11 +68,11 @@ def main(argv: list[str] | None = None) -> None:
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
     geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
-    network = runtime.open_network(model, geometry)
+    network = runtime.open_network(model, geometry, args.provider, args.threads)
     views, table = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
     sections.write(views, valid, tiling, core, args.seam_rule, args)
     store.write_table(args.corners, table)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

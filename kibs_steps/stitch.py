@@ -5,6 +5,9 @@ blocks found here from the stored strips; a section is a connected group of link
 beyond its own tile's core and which no neighbour confirms is voted out: the tile that answers for that place does not see it.
 Union-find has no order, so results depend neither on the order of blocks nor on their size.
 
+Which pieces belong together is found for the whole raster at once, from numbers alone. Outlines are joined in a **sweep** over
+the rows of blocks: a section leaves as soon as nothing below can touch it, so memory holds a row of blocks, not the city.
+
 In: all blocks' pieces, links, seams and corners. Out: `stitched/sections.parquet` (each section in the block that holds its id
 pixel) and `stitched/corners.parquet` (the corners within reach of each block's sections), both with a column `block`.
 """
@@ -12,21 +15,24 @@ pixel) and `stitched/corners.parquet` (the corners within reach of each block's 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
-from kibs_steps import cli, scan_order, scene, store
+from kibs_steps import cli, scene, store
+from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Block, Grid, Tiling
 from kibs_steps.sections import SEAM_RULES, links_across
 
 CUT = 2.0  # px: smoothing moves an outline no further
 SAME_CORNER = 3.0  # px: two tiles' views of one corner lie closer than two corners of a roof
+NEAR = 4.0  # px: sections closer than this are smoothed together; smoothing moves no outline as far
+NUMBERS = ["label", "tile_row", "tile_col", "core_area", "full_area"]
+FACTS = ["label", "outline", "score", "void", "split", "owner"]
 
 SECTIONS = pa.schema(
     [
@@ -41,8 +47,62 @@ SECTIONS = pa.schema(
 )
 
 
+class Detections(NamedTuple):
+    """How to read what was found in a block: its pieces (the columns asked for), links, seams, corners."""
+
+    pieces: Callable[[Block, list[str]], pa.Table]
+    links: Callable[[Block], pa.Table]
+    seams: Callable[[Block], dict[str, np.ndarray]]
+    corners: Callable[[Block], pa.Table]
+
+
+class Joined(NamedTuple):
+    """Of every piece of the raster, numbered by tile and label: its group, whether it stands, its block row.
+
+    `number` gives, by block name, the numbers of the block's pieces in their table's order.
+    """
+
+    number: dict[str, np.ndarray]
+    group: np.ndarray
+    stands: np.ndarray
+    row: np.ndarray
+
+    def last_row(self) -> np.ndarray:
+        """The last block row in which each group has a piece that stands."""
+        last = np.full(self.group.max(initial=-1) + 1, -1)
+        np.maximum.at(last, self.group[self.stands], self.row[self.stands])
+        return last
+
+
+class Parts(NamedTuple):
+    """Columns of outlines (px) on their way: piece number (or 0), group, geometry, score, void, split, owner."""
+
+    number: np.ndarray
+    group: np.ndarray
+    geometry: np.ndarray
+    score: np.ndarray
+    void: np.ndarray
+    split: np.ndarray
+    owner: np.ndarray
+
+    def take(self, rows: np.ndarray) -> Parts:
+        """The chosen rows."""
+        return Parts(*(column[rows] for column in self))
+
+    @staticmethod
+    def joined(some: list[Parts]) -> Parts:
+        """Rows of several, one after the other."""
+        return Parts(*(np.concatenate(columns) for columns in zip(*some, strict=True)))
+
+
+NOTHING = Parts(*(np.zeros(0, kind) for kind in (np.int64, np.int64, object, float, bool, np.int64, np.int64)))
+
+
 def groups(n: int, links: np.ndarray) -> np.ndarray:
     """Group number (n,) of each piece, from links (m, 2): connected components."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_array((np.ones(len(links), bool), (links[:, 0], links[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1]
 
@@ -54,43 +114,67 @@ def confirmed(core_area: np.ndarray, full_area: np.ndarray, links: np.ndarray) -
     return (core_area > 0) & (linked | (2 * core_area >= full_area))
 
 
-def block_links(
-    seams: dict[tuple[int, int], dict[str, np.ndarray]],
-    first_piece: dict[tuple[int, int], dict[int, int]],
-    rule: str = "overlap",
-) -> np.ndarray:
-    """Links (n, 2) between pieces of neighbouring blocks, as piece numbers; both dicts are by block (row, col)."""
-    found = [np.zeros((0, 2), np.int64)]
-    for (row, col), sides in seams.items():
-        for side, other_side, neighbour in (("east", "west", (row, col + 1)), ("south", "north", (row + 1, col))):
-            if neighbour in seams and sides[side].size:
-                number, other = first_piece[row, col], first_piece[neighbour]
-                pairs = links_across(sides[side], seams[neighbour][other_side], side, rule)
-                found.append(np.array([(number[a], other[b]) for a, b in pairs.tolist()], np.int64).reshape(-1, 2))
-    return np.concatenate(found)
+def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
+    """Which pieces of all blocks are one section. Reads numbers and seams only, seams of two rows of blocks at a time."""
+    tables = {b.name: found.pieces(b, NUMBERS) for b in blocks}
+    column = {name: np.concatenate([t[name].to_numpy() for t in tables.values()]) for name in NUMBERS}
+    # Pieces are numbered by tile, whatever block a tile belongs to, so that sums over them do not depend on blocks.
+    order = np.lexsort([column[key] for key in ("label", "tile_col", "tile_row")])
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    cuts = np.cumsum([len(t) for t in tables.values()])[:-1]
+    number = dict(zip(tables, np.split(rank, cuts), strict=True))
+    labels = {name: t["label"].to_numpy() for name, t in tables.items()}
+    row = np.empty(len(order), np.int64)
+    for block in blocks:
+        row[number[block.name]] = block.row
+
+    def numbered(block: Block, values: np.ndarray) -> np.ndarray:
+        by_label = np.argsort(labels[block.name])
+        return number[block.name][by_label[np.searchsorted(labels[block.name], values, sorter=by_label)]]
+
+    links = [np.zeros((0, 2), np.int64)]
+    at: dict[tuple[int, int], tuple[Block, dict[str, np.ndarray]]] = {}
+    for block in sorted(blocks, key=lambda b: (b.row, b.col)):
+        inner = found.links(block)
+        links.append(np.stack([numbered(block, inner[name].to_numpy()) for name in ("first", "second")], axis=1))
+        seams = found.seams(block)
+        for place, side, other_side in (
+            ((block.row, block.col - 1), "east", "west"),
+            ((block.row - 1, block.col), "south", "north"),
+        ):
+            if place in at and seams[other_side].size:
+                neighbour, theirs = at[place]
+                pairs = links_across(theirs[side], seams[other_side], side, rule)
+                links.append(np.stack([numbered(neighbour, pairs[:, 0]), numbered(block, pairs[:, 1])], axis=1))
+        at.pop((block.row - 1, block.col), None)
+        at[block.row, block.col] = block, seams
+    link = np.concatenate(links)
+    stands = confirmed(column["core_area"][order], column["full_area"][order], link)
+    return Joined(number, groups(len(order), link), stands, row)
 
 
-def united(
-    outlines: np.ndarray, group: np.ndarray, score: np.ndarray, void: np.ndarray, split: np.ndarray, owner: np.ndarray
-) -> dict[str, list]:
-    """Sections from piece outlines (n,) grouped by `group`: union, then one section per connected part.
+def united(pieces: Parts) -> Parts:
+    """Sections from pieces in order of number: the union of every group, then one section per connected part.
 
-    Scores are means weighted by area. Returns columns geometry, score, void, split, owner.
+    Scores are means weighted by area.
     """
-    order = np.argsort(group, kind="stable")
-    starts = np.flatnonzero(np.r_[True, np.diff(group[order]) != 0]) if len(order) else np.zeros(0, int)
-    area = shapely.area(outlines)
-    columns: dict[str, list] = {"geometry": [], "score": [], "void": [], "split": [], "owner": []}
+    order = np.argsort(pieces.group, kind="stable")
+    starts = np.flatnonzero(np.r_[True, np.diff(pieces.group[order]) != 0]) if len(order) else np.zeros(0, int)
+    area = shapely.area(pieces.geometry)
+    rows = []
     for members in np.split(order, starts[1:]) if len(order) else []:
-        whole = outlines[members[0]] if len(members) == 1 else shapely.union_all(outlines[members])
-        weight = area[members] / area[members].sum()
-        for part in shapely.get_parts(whole):
-            columns["geometry"].append(part)
-            columns["score"].append(float((weight * score[members]).sum()))
-            columns["void"].append(bool(void[members].any()))
-            columns["split"].append(int(split[members].max()))
-            columns["owner"].append(int(owner[members].max()))
-    return columns
+        some = pieces.take(members)
+        whole = some.geometry[0] if len(members) == 1 else shapely.union_all(some.geometry)
+        score = float((area[members] / area[members].sum() * some.score).sum())
+        facts = score, bool(some.void.any()), int(some.split.max()), int(some.owner.max())
+        rows += [(part, *facts) for part in shapely.get_parts(whole)]
+    if not rows:
+        return NOTHING
+    geometry, score, void, split, owner = zip(*rows, strict=True)
+    none = np.zeros(len(rows), np.int64)
+    shapes = shapely.normalize(np.array(geometry, object))
+    return Parts(none, none, shapes, np.array(score), np.array(void), np.array(split), np.array(owner))
 
 
 def section_ids(outlines: np.ndarray, grid: Grid) -> np.ndarray:
@@ -124,11 +208,19 @@ def simplified(outlines: np.ndarray, tolerance: float) -> np.ndarray:
     return np.where(bad, outlines, smooth)
 
 
+def clusters(outlines: np.ndarray) -> np.ndarray:
+    """Cluster number (n,) of each outline: those within `NEAR` of each other, directly or through others, are together."""
+    pairs = shapely.STRtree(outlines).query(outlines, predicate="dwithin", distance=NEAR).T
+    return groups(len(outlines), pairs[pairs[:, 0] < pairs[:, 1]])
+
+
 def distinct_corners(corners: pa.Table) -> pa.Table:
     """Corners seen by two tiles kept once: among corners of different tiles closer than `SAME_CORNER` px, the best score.
 
     Corners with an owner (truth) are never merged. Sorted by position.
     """
+    from scipy.spatial import cKDTree
+
     table = corners.sort_by([(key, "ascending") for key in ("row", "col", "owner", "tile_row", "tile_col")])
     if not len(table):
         return table
@@ -149,88 +241,116 @@ def distinct_corners(corners: pa.Table) -> pa.Table:
     return table.filter(pa.array(keep))
 
 
+def within_reach(corners: pa.Table, outlines: np.ndarray, reach: float) -> pa.Table:
+    """The corners (sorted by row) within `reach` px of any outline."""
+    if not len(outlines) or not len(corners):
+        return corners.slice(0, 0)
+    x0, y0, x1, y1 = shapely.total_bounds(outlines) + np.array([-reach, -reach, reach, reach])
+    rows = corners["row"].to_numpy()
+    first, end = np.searchsorted(rows, [y0, np.nextafter(y1, np.inf)])
+    band = corners.slice(first, end - first)
+    col = band["col"].to_numpy()
+    inside = np.flatnonzero((col >= x0) & (col <= x1))
+    points = shapely.points(np.stack([col[inside], band["row"].to_numpy()[inside]], axis=1))
+    near = np.unique(shapely.STRtree(points).query(outlines, predicate="dwithin", distance=reach)[1])
+    return band.take(pa.array(inside[near]))
+
+
 def touches_edge(outlines: np.ndarray, grid: Grid) -> np.ndarray:
     """Which outlines (px) reach the raster's edge."""
     x0, y0, x1, y1 = shapely.bounds(outlines).T if len(outlines) else np.zeros((4, 0))
     return (x0 <= 0.5) | (y0 <= 0.5) | (x1 >= grid.width - 0.5) | (y1 >= grid.height - 0.5)
 
 
+def finished(sections: Parts, grid: Grid, tolerance: float) -> pa.Table:
+    """Whole sections (with all that lie `NEAR` them) as a table after `SECTIONS`, by id."""
+    ids = section_ids(sections.geometry, grid)
+    order = np.argsort(ids)
+    whole, ids = sections.take(order), ids[order]
+    smooth = whole.geometry
+    if tolerance > 0 and len(smooth):
+        # Each cluster alone: what smoothing gives does not depend on which others are at hand.
+        smooth, cluster = smooth.copy(), clusters(smooth)
+        by_cluster = np.argsort(cluster, kind="stable")
+        for members in np.split(by_cluster, np.flatnonzero(np.diff(cluster[by_cluster])) + 1):
+            smooth[members] = simplified(smooth[members], tolerance)
+    edge = touches_edge(whole.geometry, grid)
+    columns = [ids, shapely.to_wkb(smooth), whole.score, whole.split, edge, whole.void, whole.owner]
+    return pa.table(columns, schema=SECTIONS)
+
+
+def sweep(
+    blocks: list[Block], found: Detections, grid: Grid, tiling: Tiling, tolerance: float, rule: str
+) -> Iterator[tuple[int, pa.Table]]:
+    """The sections of each row of blocks (table after `SECTIONS`, by id), row after row."""
+    whole = joined(blocks, found, rule)
+    last = whole.last_row()
+    rows = sorted({b.row for b in blocks})
+    side = tiling.stride * tiling.block
+    waiting, open_ = NOTHING, NOTHING
+    done: list[pa.Table] = [SECTIONS.empty_table()]
+    unwritten = 0
+    for row in rows:
+        pieces = [waiting]
+        for block in blocks:
+            if block.row == row:
+                table, number = found.pieces(block, FACTS), whole.number[block.name]
+                shapes = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False))
+                rest = [table[name].to_numpy(zero_copy_only=False) for name in FACTS[2:]]
+                pieces.append(Parts(number, whole.group[number], shapes, *rest).take(whole.stands[number]))
+        every = Parts.joined(pieces)
+        every = every.take(np.argsort(every.number))
+        ready = last[every.group] <= row
+        complete, waiting = every.take(ready), every.take(~ready)
+        if rule == "touch":
+            from kibs_steps import scan_order
+
+            split = scan_order.first_come(complete.geometry, complete.group, complete.split)
+            complete = complete._replace(split=split)
+        open_ = Parts.joined([open_, united(complete)])
+        limit = (row + 1) * side
+        leaves = np.ones(len(open_.group), bool)
+        if tolerance > 0 and row != rows[-1]:
+            shapes = np.concatenate([open_.geometry, waiting.geometry])
+            cluster, low = clusters(shapes), shapely.bounds(shapes)[:, 3]
+            stays = low + NEAR >= limit
+            stays[len(leaves) :] = True
+            leaves = ~np.isin(cluster, cluster[stays])[: len(leaves)]
+        done.append(finished(open_.take(leaves), grid, tolerance))
+        open_ = open_.take(~leaves)
+        held = np.concatenate([open_.geometry, waiting.geometry])
+        top = shapely.bounds(held)[:, 1].min(initial=np.inf) if row != rows[-1] else np.inf
+        table = pa.concat_tables(done).sort_by("section_id")
+        of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 0]
+        while unwritten < len(rows) and rows[unwritten] <= row and (rows[unwritten] + 1) * side <= top:
+            leaving = of <= rows[unwritten]
+            yield rows[unwritten], table.filter(pa.array(leaving))
+            table, of = table.filter(pa.array(~leaving)), of[~leaving]
+            unwritten += 1
+        done = [table]
+
+
 def stitch(
     blocks: list[Block],
-    pieces: list[pa.Table],
-    links: list[pa.Table],
-    seams: list[dict[str, np.ndarray]],
-    corners: list[pa.Table],
+    found: Detections,
     grid: Grid,
     tiling: Tiling,
     tolerance: float,
     reach: float,
     rule: str = "overlap",
-) -> tuple[list[pa.Table], list[pa.Table]]:
-    """Sections and corners of each block (tables after `SECTIONS` and `corners.CORNERS`), from all blocks' detections.
+) -> Iterator[tuple[Block, pa.Table, pa.Table]]:
+    """Every block, row by row, with its sections and corners (tables after `SECTIONS` and `corners.CORNERS`).
 
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
     corners may lie; `rule` as in `sections.links_across`: by `touch` the first piece in scan order also gives the split.
     """
-    # Pieces are numbered by tile, whatever block a tile belongs to, so that sums over them do not depend on blocks.
-    every = pa.concat_tables(pieces)
-    order = np.lexsort([every[key].to_numpy() for key in ("label", "tile_col", "tile_row")])
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    every = every.take(pa.array(order))
-    number: dict[tuple[int, int], dict[int, int]] = {}
-    used, all_links = 0, [np.zeros((0, 2), np.int64)]
-    for block, table, inner in zip(blocks, pieces, links, strict=True):
-        labels = table["label"].to_pylist()
-        own = dict(zip(labels, rank[used : used + len(labels)].tolist(), strict=True))
-        number[block.row, block.col] = own
-        pairs = zip(inner["first"].to_pylist(), inner["second"].to_pylist(), strict=True)
-        all_links.append(np.array([(own[a], own[b]) for a, b in pairs], np.int64).reshape(-1, 2))
-        used += len(labels)
-    all_links.append(block_links({(b.row, b.col): s for b, s in zip(blocks, seams, strict=True)}, number, rule))
-    link = np.concatenate(all_links)
-    stands = confirmed(every["core_area"].to_numpy(), every["full_area"].to_numpy(), link)
-    outlines = shapely.from_wkb(every["outline"].to_numpy(zero_copy_only=False)[stands])
-    group, split = groups(len(every), link)[stands], every["split"].to_numpy()[stands]
-    if rule == "touch":
-        split = scan_order.first_come(outlines, group, split)
-    columns = united(
-        outlines,
-        group,
-        every["score"].to_numpy()[stands],
-        every["void"].to_numpy(zero_copy_only=False)[stands],
-        split,
-        every["owner"].to_numpy()[stands],
-    )
-    whole = shapely.normalize(np.array(columns["geometry"], object))
-    ids = section_ids(whole, grid)
-    order = np.argsort(ids)
-    whole, ids = whole[order], ids[order]
-    edge = touches_edge(whole, grid)
-    smooth = simplified(whole, tolerance) if tolerance > 0 else whole
-    table = pa.table(
-        [
-            ids,
-            shapely.to_wkb(smooth),
-            np.array(columns["score"], float)[order],
-            np.array(columns["split"], np.int64)[order],
-            edge,
-            np.array(columns["void"], bool)[order],
-            np.array(columns["owner"], np.int64)[order],
-        ],
-        schema=SECTIONS,
-    )
-    kept = distinct_corners(pa.concat_tables(corners))
-    block_of = owner_blocks(ids, grid, tiling)
-    xy = shapely.points(np.stack([kept["col"].to_numpy(), kept["row"].to_numpy()], axis=1))
-    tree = shapely.STRtree(xy)
-    sections_out, corners_out = [], []
-    for block in blocks:
-        mine = np.flatnonzero((block_of == (block.row, block.col)).all(axis=1))
-        sections_out.append(table.take(pa.array(mine)))
-        near = np.unique(tree.query(smooth[mine], predicate="dwithin", distance=reach)[1]) if len(mine) else mine
-        corners_out.append(kept.take(pa.array(near)))
-    return sections_out, corners_out
+    corners = distinct_corners(pa.concat_tables([CORNERS.empty_table(), *(found.corners(b) for b in blocks)]))
+    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule):
+        of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 1]
+        for block in sorted((b for b in blocks if b.row == row), key=lambda b: b.col):
+            mine = table.filter(pa.array(of == block.col))
+            outlines = shapely.from_wkb(mine["outline"].to_numpy(zero_copy_only=False))
+            yield block, mine, within_reach(corners, outlines, reach)
 
 
 def cut_by(table: pa.Table, missing: np.ndarray) -> pa.Table:
@@ -267,31 +387,28 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
+    parser.add_argument("--without-corners", action="store_true", help="no corners were looked for")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
     parser.add_argument("--corners", required=True, help="out: corners of all blocks")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     tiling = Tiling(args.tile, args.margin, args.block)
-    folders = [Path(f) for f in args.folders]
-    blocks = [tiling.block_of(f.parent.name) for f in folders]
-    found = stitch(
-        blocks,
-        [store.read_table(f / "pieces.parquet") for f in folders],
-        [store.read_table(f / "links.parquet") for f in folders],
-        [store.read_arrays(f / "seams.npz") for f in folders],
-        [store.read_table(f / "corners.parquet") for f in folders],
-        facts.grid,
-        tiling,
-        args.tolerance,
-        args.reach,
-        args.seam_rule,
+    folders = {f.parent.name: f for f in map(Path, args.folders)}
+    found = Detections(
+        pieces=lambda b, columns: store.read_table(folders[b.name] / "pieces.parquet", columns),
+        links=lambda b: store.read_table(folders[b.name] / "links.parquet"),
+        seams=lambda b: store.read_arrays(folders[b.name] / "seams.npz"),
+        corners=lambda b: (
+            CORNERS.empty_table() if args.without_corners else store.read_table(folders[b.name] / "corners.parquet")
+        ),
     )
+    blocks = [tiling.block_of(name) for name in folders]
     missing = missing_areas(blocks, facts.grid, tiling)
-    found = [cut_by(table, missing) for table in found[0]], found[1]
-    names = [b.name for b in blocks]
-    store.write_by_block(args.sections, dict(zip(names, found[0], strict=True)))
-    store.write_by_block(args.corners, dict(zip(names, found[1], strict=True)))
+    with store.by_block(args.sections, SECTIONS) as sections, store.by_block(args.corners, CORNERS) as corners:
+        for block, mine, near in stitch(blocks, found, facts.grid, tiling, args.tolerance, args.reach, args.seam_rule):
+            sections(block.name, cut_by(mine, missing))
+            corners(block.name, near)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

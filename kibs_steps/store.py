@@ -15,19 +15,20 @@ import shutil
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from kibs_steps import sums
 from kibs_steps.errors import AGAIN, KibsError
 from kibs_steps.sums import DamagedFile  # noqa: F401 (raised by the readers here)
 
 FULL = 1 << 16  # bytes free on a disk that is as good as full
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 class DiskFull(KibsError):
@@ -89,28 +90,100 @@ def read_json(path: str | Path) -> Any:
 
 def write_table(path: str | Path, table: pa.Table) -> None:
     """Write an Arrow table as Parquet (zstd)."""
+    import pyarrow.parquet as pq
+
     with whole(path) as temporary:
         pq.write_table(table, temporary, compression="zstd")
 
 
-def write_by_block(path: str | Path, tables: dict[str, pa.Table]) -> None:
-    """Write one table per block to one Parquet file, with a column `block` and row groups a reader of one block can skip."""
+@contextlib.contextmanager
+def by_block(path: str | Path, schema: pa.Schema) -> Iterator[Callable[[str, pa.Table], None]]:
+    """Yield a function that appends one block's table to a Parquet file, with a column `block`.
+
+    Every block has row groups of its own, so a reader of one block skips the others and a writer holds one at a time.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     with whole(path) as temporary:
-        schema = next(iter(tables.values())).schema.append(pa.field("block", pa.string()))
-        with pq.ParquetWriter(temporary, schema, compression="zstd") as target:
-            for name, table in tables.items():
+        named = schema.append(pa.field("block", pa.string()))
+        with pq.ParquetWriter(temporary, named, compression="zstd") as target:
+
+            def append(name: str, table: pa.Table) -> None:
                 target.write_table(table.append_column("block", pa.array([name] * len(table), pa.string())))
+
+            yield append
+
+
+def write_by_block(path: str | Path, tables: dict[str, pa.Table]) -> None:
+    """Write one table per block to one Parquet file (`by_block`)."""
+    with by_block(path, next(iter(tables.values())).schema) as append:
+        for name, table in tables.items():
+            append(name, table)
 
 
 def read_table(path: str | Path, columns: list[str] | None = None, block: str | None = None) -> pa.Table:
-    """Read a Parquet table, or one block's rows of it (without the column `block`); damage raises `DamagedFile`."""
-    with sums.opened(path) as source:
+    """Read a Parquet table, or one block's rows of it (without the column `block`); damage raises `DamagedFile`.
+
+    By `ParquetFile`: `pyarrow.parquet.read_table` imports pyarrow's data sets, and with them pandas.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with sums.opened(path) as file:
         try:
-            if block is not None:
-                return pq.read_table(source, columns=columns, filters=[("block", "=", block)]).drop_columns(["block"])
-            return pq.read_table(source, columns=columns)
+            with pq.ParquetFile(file) as source:
+                if block is None:
+                    return source.read(columns)
+                key = source.schema_arrow.names.index("block")
+                facts = [source.metadata.row_group(i) for i in range(source.num_row_groups)]
+                mine = [i for i, g in enumerate(facts) if g.num_rows and g.column(key).statistics.min == block]
+                table = source.read_row_groups(mine, columns) if mine else source.schema_arrow.empty_table()
+                kept = [name for name in columns or table.column_names if name != "block"]
+                return table.select(kept)
         except (pa.ArrowInvalid, OSError) as error:
             raise sums.damaged(path, error) from error
+
+
+def merged(paths: list[str] | list[Path], order: list[str], columns: list[str] | None = None) -> Iterator[pa.Table]:
+    """The rows of many tables in ascending `order`, some at a time; at least one table, which may be empty.
+
+    Row groups are read in order of their smallest first key, and rows leave once no later group can come before them: when
+    ids run along the raster, as sections' do, about a row of blocks is in memory. Raises `DamagedFile`.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    import pyarrow.parquet as pq
+
+    groups = []
+    for path in paths:
+        with sums.opened(path) as file:
+            try:
+                facts = pq.read_metadata(file)
+            except (pa.ArrowInvalid, OSError) as error:
+                raise sums.damaged(path, error) from error
+        key = facts.schema.to_arrow_schema().names.index(order[0])
+        some = ((facts.row_group(i), i) for i in range(facts.num_row_groups))
+        groups += [(g.column(key).statistics.min, str(path), i) for g, i in some if g.num_rows]
+    groups.sort()
+    by = [(name, "ascending") for name in order]
+    held = read_table(paths[0], columns).slice(0, 0)
+    if not groups:
+        yield held
+    for k, (_, path, i) in enumerate(groups):
+        with sums.opened(path) as file:
+            try:
+                rows = pq.ParquetFile(file).read_row_group(i, columns)
+            except (pa.ArrowInvalid, OSError) as error:
+                raise sums.damaged(path, error) from error
+        held = pa.concat_tables([held, rows], promote_options="permissive")
+        if k + 1 < len(groups):
+            leaves = pc.less(held[order[0]], groups[k + 1][0])
+            ready, held = held.filter(leaves), held.filter(pc.invert(leaves))
+        else:
+            ready = held
+        if len(ready):
+            yield ready.sort_by(by)
 
 
 def write_arrays(path: str | Path, arrays: dict[str, np.ndarray]) -> None:

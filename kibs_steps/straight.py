@@ -41,11 +41,14 @@ TINY = 0.01  # m, shortest edge of any partition
 COLLINEAR = 0.002  # m, a vertex this near to the line between its neighbours says nothing
 
 
-def ragged(faces: list[Face], reach: float = REACH) -> list[Face]:
-    """Straight faces of ragged ones, rims moved by `reach` (m) at most; as they were where no straight version tiles."""
+def ragged(faces: list[Face], reach: float = REACH, building: np.ndarray | None = None) -> list[Face]:
+    """Straight faces of ragged ones, rims moved by `reach` (m) at most; as they were where no straight version tiles.
+
+    `building` (n,): building of each section, each with a main direction of its own; one for all unless given.
+    """
     junctions = {point for point, others in _around(faces).items() if len(others) > 2}
     faces = _contracted(faces, reach, junctions)
-    faces = _straight(faces, reach) or faces
+    faces = _straight(faces, reach, building) or faces
     shorter = without_collinear(_contracted(faces, NOISE), NOISE / 5)
     return tidied(shorter if is_coverage(shorter) else faces)
 
@@ -55,18 +58,19 @@ def tidied(faces: list[Face]) -> list[Face]:
     return without_collinear(_contracted(_clear(_contracted(faces, TINY)), TINY), COLLINEAR)
 
 
-def _straight(faces: list[Face], reach: float) -> list[Face] | None:
+def _straight(faces: list[Face], reach: float, building: np.ndarray | None) -> list[Face] | None:
     """Faces whose rims are straight within `reach` (m), or None if they would no longer tile.
 
     Each chain of edges between two junctions is cut by Douglas and Peucker; to each piece a line is fitted over all of the chain
     that it replaces; each vertex goes to where the lines of its pieces meet. Faces that this breaks stay as they are.
     """
     pieces = [piece for chain in _chains(faces) for piece in _pieces(chain, reach)]
-    main = _main_direction(pieces)
+    owner = _owners(pieces, faces, building)
+    main = {o: _main_direction([p for p, own in zip(pieces, owner, strict=True) if own == o]) for o in set(owner)}
     stiff: dict[Point, np.ndarray] = {}
     pull: dict[Point, np.ndarray] = {}
-    for piece in pieces:
-        normal, offset, weight = _line(piece, main, reach)
+    for piece, own in zip(pieces, owner, strict=True):
+        normal, offset, weight = _line(piece, main[own], reach)
         for point in (piece[0], piece[-1]):
             place = np.array(point) / MM
             stiff.setdefault(point, ANCHOR * np.eye(2))
@@ -87,6 +91,18 @@ def _straight(faces: list[Face], reach: float) -> list[Face] | None:
             return straight
         rough |= wrong
     return None
+
+
+def _owners(pieces: list[list[Point]], faces: list[Face], building: np.ndarray | None) -> list[int]:
+    """The building that each piece of rim belongs to; of two, the first."""
+    if building is None:
+        return [0] * len(pieces)
+    edges = directed_edges(faces)
+    owners = []
+    for u, v, *_ in pieces:
+        beside = [edges[e] for e in ((u, v), (v, u)) if e in edges]
+        owners.append(min(int(building[faces[f].section]) for f in beside))
+    return owners
 
 
 def _around(faces: list[Face]) -> dict[Point, list[Point]]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 
 class Terrain(NamedTuple):
@@ -24,9 +23,15 @@ class Terrain(NamedTuple):
     def __call__(self, x_y: np.ndarray) -> np.ndarray:
         """Heights (n,) in m at map positions (n, 2)."""
         x_y = np.asarray(x_y, float)
-        col = (x_y[..., 0] - self.x0) / self.step[0]
-        row = (self.y0 - x_y[..., 1]) / self.step[1]
-        return map_coordinates(self.heights, [row, col], order=1, mode="nearest", output=np.float64)
+        rows, cols = self.heights.shape
+        col = np.clip((x_y[..., 0] - self.x0) / self.step[0], 0.0, cols - 1.0)
+        row = np.clip((self.y0 - x_y[..., 1]) / self.step[1], 0.0, rows - 1.0)
+        left, top = np.nan_to_num(col).astype(np.int64), np.nan_to_num(row).astype(np.int64)
+        right, below = np.minimum(left + 1, cols - 1), np.minimum(top + 1, rows - 1)
+        along, down = col - left, row - top
+        above = self.heights[top, left] * (1 - along) + self.heights[top, right] * along
+        under = self.heights[below, left] * (1 - along) + self.heights[below, right] * along
+        return above * (1 - down) + under * down
 
 
 def flat(height: float) -> Terrain:
@@ -34,8 +39,13 @@ def flat(height: float) -> Terrain:
     return Terrain(np.full((1, 1), height, np.float64), 0.0, 0.0, (1.0, 1.0))
 
 
-def read(path: str | Path, bounds: tuple[float, float, float, float], margin: float = 200.0) -> Terrain:
-    """The part of a scene's `dtm.tif` within `margin` metres of `bounds` (left, bottom, right, top)."""
+def read(
+    path: str | Path, bounds: tuple[float, float, float, float], margin: float = 200.0, step: float = 0.0
+) -> Terrain:
+    """The part of a scene's `dtm.tif` within `margin` metres of `bounds` (left, bottom, right, top).
+
+    With a `step` (m) only every so many pixels are read, as far apart as that or a little less.
+    """
     from rasterio.windows import Window
 
     from kibs_steps import raster
@@ -48,5 +58,8 @@ def read(path: str | Path, bounds: tuple[float, float, float, float], margin: fl
         r0, r1 = max(int(top) - 1, 0), min(int(bottom) + 2, source.height)
         c0, r0 = min(c0, source.width - 1), min(r0, source.height - 1)
         window = Window(c0, r0, max(c1 - c0, 1), max(r1 - r0, 1))
-        heights = source.read(1, window=window).astype(np.float64)
-    return Terrain(heights, t.c + (c0 + 0.5) * t.a, t.f + (r0 + 0.5) * t.e, (t.a, -t.e))
+        every = max(1, int(step // t.a))
+        shape = (-(-window.height // every), -(-window.width // every))
+        heights = source.read(1, window=window, out_shape=shape).astype(np.float64)
+    width, height = t.a * window.width / shape[1], -t.e * window.height / shape[0]
+    return Terrain(heights, t.c + c0 * t.a + width / 2, t.f + r0 * t.e - height / 2, (width, height))

@@ -148,6 +148,7 @@ def main(argv: list[str] | None = None) -> None:
     """Cut one block out of the raster."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.tiles", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--raster", help="a copy to read instead of the scene's raster")
     parser.add_argument("--tile", type=int, required=True, help="tile side, px")
     parser.add_argument("--margin", type=int, required=True, help="margin on each side of a tile, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
@@ -155,6 +156,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", required=True, help="out: tiles.tif")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
+    facts = facts._replace(raster=args.raster or facts.raster)
     tiling = Tiling(args.tile, args.margin, args.block)
     block = tiling.block_of(args.name)
     rgb, valid = read_block(facts, tiling, block)

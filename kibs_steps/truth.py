@@ -186,8 +186,9 @@ def convert(
     seen, standing = np.empty_like(polygons), np.empty_like(polygons)
     for rows in _cells(polygons):
         terrain = scene.terrain(tuple(shapely.total_bounds(polygons[rows])), margin=500.0)
-        points = shapely.get_coordinates(polygons[rows], include_z=True)
-        image, ground = both_frames(points, frame, vertical, terrain, scene.lean, scene.projected_on(terrain))
+        points, owner = shapely.get_coordinates(polygons[rows], include_z=True, return_index=True)
+        lean = scene.leans(shapely.get_coordinates(shapely.centroid(polygons[rows])))[owner]
+        image, ground = both_frames(points, frame, vertical, terrain, lean, scene.projected_on(terrain))
         pixels = np.column_stack([scene.grid.to_image(image[:, :2]), image[:, 2]])
         seen[rows] = shapely.set_coordinates(polygons[rows].copy(), pixels)
         standing[rows] = shapely.set_coordinates(polygons[rows].copy(), ground)

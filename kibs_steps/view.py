@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 Surface = Callable[[np.ndarray], np.ndarray]  # (n, 2) map metres -> (n,) heights in metres
+Lean = tuple[float, float] | np.ndarray  # one (2,) for all points, or one for each (n, 2); m per m, grid axes
 
 
 class Plane(NamedTuple):
@@ -45,8 +46,20 @@ def lean(azimuth: float, elevation: float, convergence: float = 0.0) -> tuple[fl
     return float(length * np.sin(angle)), float(length * np.cos(angle))
 
 
+def position_sigma(
+    height: np.ndarray, sigma: np.ndarray, elevation: np.ndarray, angle: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """σ (m) of where a point stands, along the azimuth of the view and across it (PAPER, off-nadir geometry).
+
+    `height` above ground and its `sigma` (m), `elevation` of the view (deg), `angle`: σ of both view angles (deg).
+    """
+    el, by = np.radians(elevation), np.radians(angle)
+    along = np.hypot(sigma / np.tan(el), height * by / np.sin(el) ** 2)
+    return along, np.abs(height / np.tan(el) * by)
+
+
 def ground_position(
-    image: np.ndarray, height: np.ndarray, terrain: Surface, k: tuple[float, float], projected_on: Surface | None = None
+    image: np.ndarray, height: np.ndarray, terrain: Surface, k: Lean, projected_on: Surface | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where points seen at `image` (n, 2 map metres) with `height` (n, m above the ground under them) really are.
 
@@ -66,7 +79,7 @@ def ground_position(
     return position, terrain(position) + height
 
 
-def image_position(ground: np.ndarray, z: np.ndarray, k: tuple[float, float], projected_on: Surface) -> np.ndarray:
+def image_position(ground: np.ndarray, z: np.ndarray, k: Lean, projected_on: Surface) -> np.ndarray:
     """Where the image shows points standing at `ground` (n, 2) with absolute height `z` (n,): the inverse of the above."""
     ground = np.asarray(ground, float)
     k = np.asarray(k, float)
@@ -80,16 +93,15 @@ def image_position(ground: np.ndarray, z: np.ndarray, k: tuple[float, float], pr
     return position
 
 
-def ray_meets_plane(
-    image: np.ndarray, plane: Plane, k: tuple[float, float], projected_on: Surface
-) -> tuple[np.ndarray, np.ndarray]:
+def ray_meets_plane(image: np.ndarray, plane: Plane, k: Lean, projected_on: Surface) -> tuple[np.ndarray, np.ndarray]:
     """Where the view rays of pixels `image` (n, 2 map metres) meet a plane: positions (n, 2) and absolute heights (n,).
 
     On the ray P = P_img + (z − T0)·k, so z·(1 − g·k) = plane(P_img) − T0·(g·k) with g = (a, b): closed form. A plane seen
     edge-on (g·k → 1) has no meeting point; callers bound the slope.
     """
     image = np.asarray(image, float)
+    k = np.asarray(k, float)
     base = projected_on(image)
-    steepness = plane.a * k[0] + plane.b * k[1]
+    steepness = plane.a * k[..., 0] + plane.b * k[..., 1]
     z = (plane.at(image) - base * steepness) / (1.0 - steepness)
-    return image + (z - base)[..., None] * np.asarray(k, float), z
+    return image + (z - base)[..., None] * k, z

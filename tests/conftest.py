@@ -8,6 +8,7 @@ import pytest
 from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks/solids"))  # the second opinion on solids
 
 # The machine's speed is no property of the code, and a failure must come back when one looks for it.
 settings.register_profile("kibs", deadline=None, derandomize=True)

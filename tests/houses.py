@@ -152,6 +152,8 @@ def ground_table(
             "score": 1.0,
             "area": float(outline.area),
             "split": 2,
+            "sigma_along": 0.1,
+            "sigma_across": 0.02,
         }
         for name, value in found.items():
             rows[name].append(value)
@@ -162,4 +164,5 @@ def building_table(sections: list[Section], **how: object) -> pa.Table:
     """`ground_table` with all sections one building."""
     table = ground_table(sections, **how)
     smallest = min(table["section_id"].to_pylist())
-    return table.append_column("building_id", pa.array([smallest] * len(table), pa.int64()))
+    one = pa.array([smallest] * len(table), pa.int64())
+    return table.append_column("building_id", one).append_column("cluster_id", one)

@@ -24,7 +24,7 @@ def grouped(shapes, planes=None, lean=(0.0, 0.0), footprint=None, ids=None):
     n = len(shapes)
     ids = np.arange(1, n + 1) if ids is None else np.asarray(ids)
     planes = np.array(planes or [LEVEL] * n)
-    return buildings.buildings(ids, np.array(shapes, object), planes, lean, footprint).tolist()
+    return buildings.buildings(ids, np.array(shapes, object), planes, lean, footprint)[0].tolist()
 
 
 def box(x0, y0, x1, y1):

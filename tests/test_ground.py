@@ -125,3 +125,50 @@ def test_azimuth_is_the_downslope_from_true_north(azimuth, slope, convergence):
 
 def test_level_sections_have_no_azimuth():
     assert np.isnan(ground.slope_azimuth(np.array([0.03]), np.array([0.03]), 0.0)[1][0])
+
+
+def regions_of(*views):
+    """Regions side by side from west to east, each with a view (azimuth, elevation)."""
+    edges = np.linspace(GRID.bounds[0], GRID.bounds[2], len(views) + 1)
+    boxes = [shapely.box(edges[k], GRID.bounds[1], edges[k + 1], GRID.bounds[3]) for k in range(len(views))]
+    return tuple(scene.Region(box, scene.Direction(*v, view.lean(*v))) for box, v in zip(boxes, views, strict=True))
+
+
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.15, -0.05)])
+def test_a_region_moves_its_sections_by_its_own_view(slope):
+    """A mosaic whose middle was seen from the west: the house there comes back as if all had been."""
+    dtm, own = sloping(*slope), facts_at(270.0, 65.0)
+    rings = house(dtm, 0.4, 6.0, 2.0)
+    tables = fed(rings, own, dtm)
+    mosaic = facts_at(180.0, 75.0)._replace(regions=regions_of((90.0, 80.0), (270.0, 65.0), (0.0, 60.0)))
+    results = []
+    for facts in (own, mosaic):
+        table, filed = planes.planes(*tables, facts, dtm, (6.0, 3.0), 7.5, "robust")
+        results.append((ground.ground(table, facts, dtm), filed))
+    assert results[0][0].equals(results[1][0])
+    assert results[0][1].equals(results[1][1])
+    found = shapely.get_coordinates(shapely.from_wkb(results[1][0]["outline_map"][0].as_py()), include_z=True)[:-1]
+    np.testing.assert_allclose(found, rings[0], atol=0.05)
+
+
+def test_outside_its_regions_a_mosaic_without_a_view_moves_nothing():
+    dtm = sloping(0.0, 0.0)
+    facts = facts_at(180.0, 60.0)._replace(view=None, regions=regions_of((90.0, 60.0), (90.0, 60.0), (90.0, 60.0))[:1])
+    rings = house(dtm, 0.3, 5.0, 2.0)
+    table, _ = planes.planes(*fed(rings, facts._replace(regions=()), dtm), facts, dtm, (6.0, 3.0), 7.5, "robust")
+    result = ground.ground(table, facts, dtm)
+    found = shapely.get_coordinates(shapely.from_wkb(result["outline_map"][0].as_py()))[:-1]
+    np.testing.assert_allclose(found, rings[0][:, :2], atol=1e-6)
+    assert result["sigma_along"].to_pylist() == [None, None]
+
+
+def test_sigma_of_position_is_what_shaken_angles_and_heights_give():
+    """Closed form against 20,000 draws of height, elevation and azimuth."""
+    rng = np.random.default_rng(3)
+    n, h, sigma_h, elevation, angle = 20_000, 9.0, 0.8, 62.0, 0.6
+    el = np.radians(elevation + rng.normal(0, angle, n))
+    az = np.radians(rng.normal(0, angle, n))
+    length = (h + rng.normal(0, sigma_h, n)) / np.tan(el)
+    along, across = view.position_sigma(np.array([h]), np.array([sigma_h]), np.array([elevation]), angle)
+    assert along[0] == pytest.approx(np.std(length * np.cos(az)), rel=0.03)
+    assert across[0] == pytest.approx(np.std(length * np.sin(az)), rel=0.03)

@@ -45,7 +45,8 @@ def changed(files, **settings):
     return {step for step in one if one[step] != other[step]}
 
 
-AFTER_DETECTION = {"stitch", "planes", "buildings", "solids_of_block", "solids", "evaluate", "run"}
+AFTER_PLANES = {"planes", "buildings", "solids_of_block", "solids", "glb", "evaluate", "run"}
+AFTER_DETECTION = {"stitch", "edited", *AFTER_PLANES}
 
 
 def test_blocks_cover_the_raster(files):
@@ -71,7 +72,7 @@ def test_another_view_leaves_detection_alone(files):
 
 
 def test_planes_rule_and_block(files):
-    assert changed(files, planes="paper") == {"planes", "buildings", "solids_of_block", "solids", "evaluate", "run"}
+    assert changed(files, planes="paper") == AFTER_PLANES
     assert "scene" not in changed(files, block=3)
 
 
@@ -124,3 +125,47 @@ def test_fingerprint_survives_a_damaged_cache(tmp_path):
     first = fingerprint.of_file(file, cache)
     cache.write_text("{")
     assert fingerprint.of_file(file, cache) == first
+
+
+def test_edited_sections_and_a_surface_model_start_where_they_are_used(files):
+    folder, _ = files
+    for name in ("edit.gpkg", "dsm.tif", "regions.gpkg"):
+        (folder / name).write_bytes(name.encode())
+    assert changed(files, sections=str(folder / "edit.gpkg")) == {"edited", *AFTER_PLANES}
+    assert changed(files, dsm=str(folder / "dsm.tif")) == {"surface", *AFTER_DETECTION}
+    assert {"scene", "planes"} <= changed(files, regions=str(folder / "regions.gpkg"))
+    assert not {"tiles", "sections"} & changed(files, regions=str(folder / "regions.gpkg"))
+    assert changed(files, drape=True) == {"glb", "run"}
+
+
+def test_angles_come_from_metadata(files):
+    folder, _ = files
+    (folder / "a.IMD").write_text("meanSatAz = 181.1;\nmeanSatEl = 59.3;\nmeanSunAz = 155;\nmeanSunEl = 45;\n")
+    config = {k: v for k, v in toy.VIEW.items() if not k.startswith(("view", "sun"))}
+    ((_, full),) = plan.scenes({"scene": "s", "raster": str(files[1]), "dtm": 0, "models": str(folder / "a"),
+                                "metadata": str(folder / "a.IMD"), **config}, SCHEMA).items()  # fmt: skip
+    assert plan.plan("s", full, folder, folder / "results").settings["view_azimuth"] == 181.1
+
+
+def test_a_simulated_city_reruns_with_its_file(files):
+    folder, _ = files
+    city = folder / "c.city.json"
+    scene = {"simulate": {"seed": 1, "size": 200, "city": str(city)}, "models": str(folder / "a")}
+    scene = {**scene, **toy.VIEW, "sun_azimuth": 155, "sun_elevation": 45}
+
+    def sources():
+        ((name, full),) = plan.scenes({"scenes": {"d": scene}}, SCHEMA).items()
+        return plan.plan(name, full, folder, folder / "results").signature["source"]
+
+    with pytest.raises(BadConfig, match="is not there"):
+        sources()
+    city.write_text("{}")
+    first = sources()
+    city.write_text("{ }")
+    assert sources() != first
+
+
+@pytest.mark.parametrize("settings", [{"provider": "openvino"}, {"threads": 2}])
+def test_other_hardware_reruns_the_models_and_nothing_before(files, settings):
+    """Sums in another order differ in their last bits: blocks of both are never mixed."""
+    assert changed(files, **settings) == {"sections", "blend", "corners", "single", *AFTER_DETECTION}

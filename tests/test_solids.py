@@ -13,7 +13,7 @@ import toy_city
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kibs_steps import gate, solids, store, terrain
+from kibs_steps import features, gate, solids, store, terrain
 from kibs_steps.shells import GROUND, ROOF, WALL
 from kibs_steps.stitch import simplified
 
@@ -22,9 +22,9 @@ FLAT = terrain.flat(0.0)
 
 def built(house, dtm=FLAT, **how):
     """The one building of a house's table: sections, solid, attributes."""
-    ((building, sections),) = solids.sections_of(houses.building_table(house, **how))
+    ((building, sections),) = solids.clusters_of(houses.building_table(house, **how))
     solid = solids.build(sections, dtm)
-    return sections, solid, solids.attributes(building, sections, solid, True)
+    return sections, solid, features.attributes(int(building[0]), sections, solid)
 
 
 def shells_are_valid(solid):
@@ -154,26 +154,46 @@ def test_parts_that_do_not_touch_are_building_parts():
     sections, solid, row = built(apart)
     assert len(solid.shells) == 2
     assert row["volume"] == pytest.approx(60 + 80)
-    feature = solids.feature(row, sections, solid, (500_000, 5_400_000), 0.0)
+    feature = features.feature(row, sections, solid, (500_000, 5_400_000), 0.0)
     assert feature["CityObjects"]["building-1"]["children"] == ["building-1-1", "building-1-2"]
     assert feature["CityObjects"]["building-1-2"]["parents"] == ["building-1"]
 
 
-def test_a_roof_below_ground_falls_back_with_the_reason():
+def test_a_roof_that_dives_into_the_ground_ends_there():
     steep = [([(0, 0), (10, 0), (10, 10), (0, 10)], (0, 0.8, -1.0))]
     _, solid, row = built(steep)
-    assert row["lod"] == "1.3"
+    assert row["lod"] == "2.0"
     assert "section 1 comes down to -1.00 m above the ground" in row["lod_reason"]
-    assert row["volume"] == pytest.approx(300.0)
+    assert row["eave_z"] == pytest.approx(0.5, abs=0.01)
+    assert row["volume"] == pytest.approx(10 * (7.0**2 - 0.5**2) / 1.6, rel=2e-3)
     assert shells_are_valid(solid)
 
 
-def test_one_section_that_dives_is_made_level_and_told():
-    house = [*houses.HIP, ([(14, 1), (22, 1), (22, 8), (14, 8)], (-0.8, 0, 17.0))]
+def test_of_a_house_only_the_section_that_dives_is_cut():
+    house = [*houses.HIP, ([(14, 1), (22, 1), (22, 8), (14, 8)], (-0.5, 0, 10.8))]
     _, solid, row = built(house)
     assert row["lod"] == "2.0"
     assert row["lod_reason"].startswith("2.0: section 5 comes down to")
-    assert row["volume"] == pytest.approx(houses.VOLUME["hip"] + 8 * 7 * 2.6, rel=1e-3)
+    assert row["volume"] == pytest.approx(houses.VOLUME["hip"] + 7 * (3.8**2 - 0.5**2) / 1.0, rel=2e-3)
+    assert row["footprint"].bounds[2] - 500_000 == pytest.approx(20.6, abs=0.02)
+    assert shells_are_valid(solid)
+
+
+def test_a_cut_may_leave_several_parts():
+    comb = shapely.box(0, 0, 12, 10) - shapely.box(3, -1, 5, 6) - shapely.box(7, -1, 9, 6)
+    sections = solids.Sections(np.array([1]), [comb], np.array([[0, 0.5, -0.5]]), ["ok"], np.full(1, 0.1), (0, 0))
+    solid = solids.build(sections, FLAT)
+    assert solid.lod == "2.0"
+    assert shells_are_valid(solid)
+    assert solid.base.bounds[1] == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_roof_mostly_below_ground_is_made_level_and_told():
+    house = [*houses.HIP, ([(14, 1), (22, 1), (22, 8), (14, 8)], (-2.0, 0, 33.0))]
+    _, solid, row = built(house)
+    assert row["lod"] == "2.0"
+    assert "of a section would lie below the ground" in row["lod_reason"]
+    assert row["eave_z"] == pytest.approx(0.5, abs=0.01)
     assert shells_are_valid(solid)
 
 
@@ -248,7 +268,7 @@ def test_bad_outlines_never_raise_and_say_why(ring):
         sections, solid, row = built(house)
         assert shells_are_valid(solid)
         assert solid.lod == "2.0" or row["lod_reason"]
-        json.dumps(solids.feature(row, sections, solid, (500_000, 5_400_000), 0.0), allow_nan=False)
+        json.dumps(features.feature(row, sections, solid, (500_000, 5_400_000), 0.0), allow_nan=False)
 
 
 @settings(max_examples=40, deadline=None)
@@ -330,10 +350,10 @@ def test_the_order_of_rows_does_not_matter():
     lines = set()
     for seed in range(4):
         order = np.random.default_rng(seed).permutation(len(table))
-        ((building, sections),) = solids.sections_of(table.take(pa.array(order)))
+        ((building, sections),) = solids.clusters_of(table.take(pa.array(order)))
         solid = solids.build(sections, FLAT)
-        row = solids.attributes(building, sections, solid, True)
-        lines.add(json.dumps(solids.feature(row, sections, solid, (500_000, 5_400_000), 0.0)))
+        row = features.attributes(int(building[0]), sections, solid)
+        lines.add(json.dumps(features.feature(row, sections, solid, (500_000, 5_400_000), 0.0)))
     assert len(lines) == 1
 
 
@@ -350,10 +370,10 @@ def test_a_block_is_written_with_attributes_and_semantics(tmp_path):
         solids.main(
             [*arguments, "--name", name, "--lod-label", "2.2", "--out", str(out), "--attributes", str(attributes)]
         )
-        head, *features = [json.loads(line) for line in out.read_text().splitlines()]
+        head, *lines = [json.loads(line) for line in out.read_text().splitlines()]
         rows = pq.read_table(attributes)
-        assert rows.schema.equals(solids.ATTRIBUTES)
-        assert (len(features), len(rows)) == (expected, expected)
+        assert rows.schema.equals(features.ATTRIBUTES)
+        assert (len(lines), len(rows)) == (expected, expected)
         assert head["transform"]["scale"] == [0.001] * 3
     head, feature = [json.loads(line) for line in (tmp_path / "r000c000.city.jsonl").read_text().splitlines()]
     (row,) = pq.read_table(tmp_path / "r000c000.parquet").to_pylist()

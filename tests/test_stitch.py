@@ -27,7 +27,7 @@ def world(tmp_path_factory):
     return toy.paint(truth, WIDTH, HEIGHT), truth, nets
 
 
-def detections(image, block_side, nets, shuffle=None):
+def detections(image, block_side, nets, shuffle=None, tolerance=0.0):
     """Stitched sections and corners of all blocks together, sorted by id."""
     grid = Grid("EPSG:32631", toy.X0, toy.Y0, toy.GSD, image.shape[1], image.shape[0])
     tiling = Tiling(toy.TILE, toy.MARGIN, block_side)
@@ -36,26 +36,29 @@ def detections(image, block_side, nets, shuffle=None):
     blocks = tiling.blocks(grid.width, grid.height)
     if shuffle is not None:
         blocks = [blocks[i] for i in shuffle.permutation(len(blocks))]
-    pieces, links, seams, found = [], [], [], []
+    pieces, links, seams, found = {}, {}, {}, {}
     for block in blocks:
         core = tiling.block_core(block, grid.width, grid.height)
         grown = core.grown(toy.MARGIN)  # the padded image starts a margin before the raster
         window = (slice(core.row, core.row + grown.height), slice(core.col, core.col + grown.width))
         network, terms = nets["sections"]
         views = sections.detect(padded[window], inside[window], tiling, block, grid, network, terms)
-        pieces.append(sections.pieces(views, inside[window], tiling, core))
+        pieces[block] = sections.pieces(views, inside[window], tiling, core)
         inner = sections.inner_links(views, toy.MARGIN)
-        links.append(pa.table({"first": inner[:, 0], "second": inner[:, 1]}))
-        seams.append(sections.seams(views, toy.MARGIN))
+        links[block] = pa.table({"first": inner[:, 0], "second": inner[:, 1]})
+        seams[block] = sections.seams(views, toy.MARGIN)
         network, terms = nets["corners"]
         tables = []
         for view in views:
             place = sections.window_in_block(tiling.window(view.tile), core, toy.MARGIN)
             rgb = sections.padded(padded[window], place)
             tables.append(corners.of_tile(heads.decode_corners(network(rgb), terms), view.tile, tiling))
-        found.append(pa.concat_tables(tables))
-    out = stitch.stitch(blocks, pieces, links, seams, found, grid, tiling, 0.0, 3.0)
-    return pa.concat_tables(out[0]).sort_by("section_id"), pa.concat_tables(out[1])
+        found[block] = pa.concat_tables(tables)
+    read = stitch.Detections(
+        lambda b, columns: pieces[b].select(columns), links.__getitem__, seams.__getitem__, found.__getitem__
+    )
+    _, each, near = zip(*stitch.stitch(blocks, read, grid, tiling, tolerance, 3.0), strict=True)
+    return pa.concat_tables(each).sort_by("section_id"), pa.concat_tables(near)
 
 
 def test_every_painted_section_comes_back_once(world):
@@ -70,12 +73,13 @@ def test_every_painted_section_comes_back_once(world):
         assert iou.max() > 1 - 6 / (w * h)
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 1.5])
 @pytest.mark.parametrize("side", [1, 3, 16])
-def test_blocks_do_not_matter(world, side):
+def test_blocks_do_not_matter(world, side, tolerance):
     """Another block size, or another order of blocks, gives the same ids, outlines, scores."""
     image, _, nets = world
-    expected, expected_corners = detections(image, 2, nets)
-    table, found = detections(image, side, nets, shuffle=np.random.default_rng(side))
+    expected, expected_corners = detections(image, 2, nets, tolerance=tolerance)
+    table, found = detections(image, side, nets, np.random.default_rng(side), tolerance)
     assert table.equals(expected)
     assert places(found) == places(expected_corners)
 

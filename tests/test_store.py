@@ -106,3 +106,27 @@ class TestArrays:
         (tmp_path / "a.npz").write_bytes(content)
         with pytest.raises(store.DamagedFile, match="is deleted now"):
             store.read_arrays(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("cuts", [[], [3], [10, 11, 40], list(range(1, 60, 7))])
+def test_merged_tables_are_one_sorted_table(tmp_path, cuts):
+    """Whatever the cut into files and row groups, rows come in order, all of them, in parts."""
+    rng = np.random.default_rng(len(cuts))
+    ids = np.arange(60) + rng.integers(-6, 7, 60)  # out of order by less than a file
+    table = pa.table({"id": ids, "x": rng.normal(size=60)})
+    paths = []
+    for k, part in enumerate(np.split(np.arange(60), cuts)):
+        paths.append(tmp_path / f"{k}.parquet")
+        store.write_by_block(
+            paths[-1], {"a": table.take(part[::2]), "none": table.slice(0, 0), "b": table.take(part[1::2])}
+        )
+    parts = list(store.merged(paths[::-1], ["id", "x"], ["id", "x"]))
+    assert pa.concat_tables(parts).equals(table.sort_by([("id", "ascending"), ("x", "ascending")]))
+    assert len(cuts) < 3 or len(parts) > 2
+
+
+def test_merging_nothing_gives_the_columns(tmp_path):
+    store.write_table(tmp_path / "a.parquet", pa.table({"id": pa.array([], pa.int64())}))
+    (part,) = store.merged([tmp_path / "a.parquet"], ["id"])
+    assert part.column_names == ["id"]
+    assert len(part) == 0

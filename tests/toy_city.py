@@ -144,6 +144,8 @@ def buildings_table(scene: Scene, found: list[tuple[int, int, shapely.Polygon]] 
                 "score": 0.9,
                 "area": outline.area,
                 "split": section % 3,
+                "sigma_along": 0.3,
+                "sigma_across": 0.05,
                 "building_id": building,
             }
         )

@@ -15,17 +15,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
-from pycocotools import mask as masks
-from pycocotools.coco import COCO
 
 from kibs_steps import cli, store
 from kibs_steps.errors import KibsError
 from kibs_steps.learn import dataset
 from kibs_steps.learn.dataset import Sample
+
+if TYPE_CHECKING:
+    from pycocotools.coco import COCO
 
 SQUARE = 15  # px: side q of a corner's square (PAPER, data and tiling)
 SECTION = 1  # category id
@@ -110,6 +111,8 @@ def annotations(
 
 
 def _annotation(number: int, image: int, category: int, where: np.ndarray, crowd: bool = False) -> dict[str, Any]:
+    from pycocotools import mask as masks
+
     code = masks.encode(np.asfortranarray(where.astype(np.uint8)))
     return {
         "id": number,
@@ -165,6 +168,8 @@ def read(folder: str | Path, images: str | Path | None = None) -> Iterator[tuple
 
 def _opened(path: Path) -> COCO:
     """A COCO index without pycocotools' chatter; `BadAnnotations` for what is none."""
+    from pycocotools.coco import COCO
+
     if not path.is_file():
         raise BadAnnotations(f"no {path}: give a folder with sections.json, corners.json and images/")
     content = store.read_json(path)

@@ -10,13 +10,18 @@ from __future__ import annotations
 import tarfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
+from rasterio.features import rasterize
 
 from kibs_steps.errors import KibsError
 from kibs_steps.models import runtime
+
+if TYPE_CHECKING:
+    from kibs_steps.simulate.citymodel import CityModel
+    from kibs_steps.simulate.draped import House
 
 GSD = 0.38  # m per px of the models trained here
 GRAPH_GSD = 0.06  # m per px, about, of the roof-graph photographs
@@ -141,15 +146,31 @@ def simulated(
     size: int = 320,
     backgrounds: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
     view_elevation: tuple[float, float] = (45.0, 90.0),
+    view: tuple[float, float] | None = None,
+    sun: tuple[float, float] | None = None,
+    cities: Sequence[CityModel] = (),
+    houses: Sequence[House] = (),
 ) -> Sample:
     """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere.
 
-    `backgrounds` are photographs (rgb, usable as ground: bool) for the simulator's ground.
+    `backgrounds` are photographs (rgb, usable as ground: bool) for the simulator's ground. `view` and `sun` (azimuth, elevation
+    deg) fix the directions but for a degree or two, for models of one scene. Some tiles show one of the real `cities`, some
+    photographed `houses` (`simulate.draped`).
     """
     from kibs_steps.simulate.scene import random_scene
 
     gsd = GSD * rng.uniform(0.9, 1.1)
-    rendering, geometry = random_scene(rng, size=size, gsd=gsd, view_elevation=view_elevation, backgrounds=backgrounds)
+    rendering, geometry = random_scene(
+        rng,
+        size=size,
+        gsd=gsd,
+        view_elevation=view_elevation,
+        backgrounds=backgrounds,
+        view=near(view, rng),
+        sun=near(sun, rng),
+        cities=cities,
+        houses=houses,
+    )
     section = rendering.section.astype(np.int32)
     return Sample(
         rendering.rgb,
@@ -162,6 +183,16 @@ def simulated(
         np.ones(section.shape, np.uint8),
         np.asarray(geometry, np.float32).reshape(6),
     )
+
+
+def near(
+    direction: tuple[float, float] | None, rng: np.random.Generator, spread: float = 1.5
+) -> tuple[float, float] | None:
+    """A direction (azimuth, elevation deg) close to one given, None if none is."""
+    if direction is None:
+        return None
+    azimuth, elevation = direction[0] + rng.normal(0, spread), direction[1] + rng.normal(0, spread)
+    return azimuth % 360, float(np.clip(elevation, 5.0, 89.9))
 
 
 def chip_sample(chip: Chip, rng: np.random.Generator, size: int) -> Sample:
@@ -224,9 +255,10 @@ def pasted_houses(
         graph = graphs[rng.integers(len(graphs))]
         affine = _house_affine(graph, rng, size)
         vertices = graph.vertices @ affine[:, :2].T + affine[:, 2]
-        own = np.zeros((size, size), np.int32)
-        for i, face in enumerate(graph.faces, start=1):
-            cv2.fillPoly(own, [np.round((vertices[face] - 0.5) * 16).astype(np.int32)], i, shift=4)
+        # By pixel centres: OpenCV would draw rims too, and every face half a pixel too wide.
+        rings = (vertices[np.append(face, face[0])].tolist() for face in graph.faces)
+        faces = [({"type": "Polygon", "coordinates": [ring]}, i) for i, ring in enumerate(rings, start=1)]
+        own = rasterize(faces, (size, size), dtype=np.int32)
         house = (own > 0).astype(np.uint8)
         if not house.any() or (taken & cv2.dilate(house, np.ones((5, 5), np.uint8))).any():
             continue
@@ -404,8 +436,9 @@ def load(path: str | Path) -> Sample:
 class Mixture:
     """Endless tiles for one task, the i-th always drawn with the same random numbers.
 
-    `shares` are the probabilities of (simulated, pasted houses, chips). Simulated tiles come from `pool`, a folder of kept
-    samples that another process may still be filling; while it is empty, the real sources stand in.
+    `shares` are the probabilities of (simulated, pasted houses, chips, own). Simulated tiles come from `pool`, a folder of
+    kept samples that another process may still be filling; while it is empty, the other sources stand in. `own` are files of
+    kept samples (`learn.own`). Tiles come `upright`, or turned at random.
     """
 
     def __init__(
@@ -413,10 +446,13 @@ class Mixture:
         pool: Path,
         graphs: Sequence[RoofGraph],
         chips: Sequence[Chip],
-        shares: tuple[float, float, float],
+        shares: Sequence[float],
         size: int,
         seed: int,
+        own: Sequence[Path] = (),
+        upright: bool = True,
     ):
+        self.own, self.upright = list(own), upright
         self.pool, self.graphs, self.chips = pool, graphs, chips
         self.shares, self.size, self.seed = shares, size, seed
         self._kept: list[Path] = []
@@ -427,10 +463,15 @@ class Mixture:
         if self._listed_at < 0 or index - self._listed_at > 500:
             self._kept = sorted(self.pool.glob("[!.]*.npz"))
             self._listed_at = index
-        shares = np.array(self.shares) * [bool(self._kept), bool(self.graphs), bool(self.chips)]
-        source = rng.choice(3, p=shares / shares.sum())
-        if source == 0:
-            sample = load(self._kept[rng.integers(len(self._kept))])
+        shares = np.zeros(4)
+        shares[: len(self.shares)] = self.shares
+        shares *= [bool(self._kept), bool(self.graphs) and bool(self.chips), bool(self.chips), bool(self.own)]
+        if not shares.any():
+            raise NoTrainingData(f"nothing to learn from: {self.pool} is empty and no other source has a share")
+        source = rng.choice(4, p=shares / shares.sum())
+        if source in (0, 3):
+            files = self._kept if source == 0 else self.own
+            sample = load(files[rng.integers(len(files))])
             row, col = rng.integers(0, [n - self.size + 1 for n in sample.labels.shape])
             sample = window(sample, row, col, self.size)
         else:
@@ -440,5 +481,6 @@ class Mixture:
                 sample = with_decoys(sample, other, rng)
             if source == 1:
                 sample = pasted_houses(sample, self.graphs, rng)
-        sample = upright(without_geometry(sample, rng), rng)
+        sample = without_geometry(sample, rng)
+        sample = upright(sample, rng) if self.upright else dihedral(sample, int(rng.integers(8)))
         return sample._replace(rgb=radiometry(sample.rgb, rng))

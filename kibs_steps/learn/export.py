@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from kibs_steps import cli, store
-from kibs_steps.learn import dataset, training
-from kibs_steps.learn.architectures import OUTPUTS, Dense
+from kibs_steps.learn import dataset, losses, maskrcnn, training
+from kibs_steps.learn.architectures import OUTPUTS
 from kibs_steps.models import contract as contracts
 
 TILE, MARGIN = 256, 16
@@ -28,11 +29,13 @@ THRESHOLDS["both"] = THRESHOLDS["sections"] | THRESHOLDS["corners"]
 LICENCE = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
 
 
-def contract_of(task: str, heights: tuple[float, float] | None = None, **facts: Any) -> dict[str, Any]:
+def contract_of(
+    task: str, heights: tuple[float, float] | None = None, family: str = "dense", **facts: Any
+) -> dict[str, Any]:
     """The contract of a network trained here.
 
     `heights` are mean and standard deviation (m) of the training set's corners; `facts` replace or add fields of the
-    contract: `thresholds` (merged), `seed`, `commit`, `metrics`.
+    contract: `thresholds` (merged), `metrics`, `score`, and `seed`, `commit`, `about` (what the run was trained on).
     """
     contract: dict[str, Any] = {
         "contract": 1,
@@ -58,47 +61,54 @@ def contract_of(task: str, heights: tuple[float, float] | None = None, **facts: 
             "licence": LICENCE,
         },
     }
+    trained = {**contract["trained_on"], **facts.get("about", {})}
+    contract["trained_on"] = {key: value for key, value in trained.items() if value is not None}
     contract["trained_on"].update({k: facts[k] for k in ("seed", "commit") if k in facts})
-    if task == "corners":
+    if family == "maskrcnn":
+        del contract["geometry_input"], contract["upright"]
+        contract.update(maskrcnn.contract_terms(task, heights or (6.0, 4.0)))
+        contract["thresholds"].update(facts.get("thresholds", {}))
+    elif task == "corners":
         contract["blend"] = training.BLEND
-    if task != "sections":
+    if task != "sections" and family == "dense":
         mean, sigma = heights or (6.0, 4.0)
         contract["heights"] = {
-            "edges": training.EDGES.tolist(),
-            "centres": training.CENTRES.tolist(),
+            "edges": losses.EDGES.tolist(),
+            "centres": losses.CENTRES.tolist(),
             "fallback": round(mean, 2),
             "fallback_sigma": round(sigma, 2),
         }
-    if "metrics" in facts:
-        contract["metrics"] = facts["metrics"]
+    contract.update({k: facts[k] for k in ("metrics", "score") if k in facts})
     return contracts.validate(contract, "the new contract")
 
 
-def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float]:
-    """Mean and standard deviation (m) of the corners' heights in the first kept tiles of a pool."""
+def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float] | None:
+    """Mean and standard deviation (m) of the corners' heights in the first kept tiles of a pool; None without any."""
     heights = [dataset.load(path).corner_heights for path in sorted(pool.glob("[!.]*.npz"))[:most]]
-    known = np.concatenate(heights)
+    known = np.concatenate([*heights, np.zeros(0, np.float32)])
     known = known[np.isfinite(known)]
-    return float(known.mean()), float(known.std())
+    return (float(known.mean()), float(known.std())) if len(known) else None
 
 
-def export(model: Dense, path: str | Path, contract: dict[str, Any]) -> None:
+def export(model: nn.Module, path: str | Path, contract: dict[str, Any]) -> None:
     """Write a network as ONNX with its contract; the input's side is the contract's tile."""
     import onnx
 
     tile = contract["tile"]
-    example = (torch.zeros(1, 3, tile, tile), torch.zeros(1, 6))
     model = model.eval().to(memory_format=torch.contiguous_format)
     with store.whole(path) as temporary:
-        torch.onnx.export(
-            model,
-            example,
-            str(temporary),
-            input_names=["image", "geometry"],
-            output_names=list(OUTPUTS[model.task]),
-            opset_version=17,
-            dynamo=False,
-        )
+        if contract["head"] == "instances":
+            maskrcnn.to_onnx(model, str(temporary), tile)
+        else:
+            torch.onnx.export(
+                model,
+                (torch.zeros(1, 3, tile, tile), torch.zeros(1, 6)),
+                str(temporary),
+                input_names=["image", "geometry"],
+                output_names=list(OUTPUTS[model.task]),
+                opset_version=17,
+                dynamo=False,
+            )
         proto = onnx.load(str(temporary))
         onnx.helper.set_model_props(proto, {contracts.KEY: json.dumps(contract)})
         onnx.checker.check_model(proto)
@@ -118,18 +128,29 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--commit", help="commit of the training code")
     args = parser.parse_args(argv)
     state = torch.load(args.checkpoint, weights_only=True, map_location="cpu")
-    task = args.task
-    model = training.network(task)
-    model.load_state_dict(state["average"])
-    facts: dict[str, Any] = {"thresholds": args.thresholds, "seed": state["settings"]["seed"]}
+    task, settings = args.task, training.Settings(**state["settings"])
+    average = state.get("best", {}).get("average") or state["average"]
+    model = training.network(task, settings.family)
+    model.load_state_dict(average)
+    about = {**state.get("about", {}), "tiles_seen": state["step"] * settings.batch}
+    about |= {"minutes": round(state["seconds"] / 60, 1), "converged": state.get("converged")}
+    heights = about.pop("corner_heights", None)
+    facts: dict[str, Any] = {"thresholds": args.thresholds, "seed": settings.seed, "about": about}
     if args.commit:
         facts["commit"] = args.commit
     if args.metrics:
-        facts["metrics"] = store.read_json(args.metrics)
-    heights = corner_height_moments(Path(args.pool)) if args.pool and task != "sections" else None
-    export(model, args.out, contract_of(task, heights, **facts))
+        report = store.read_json(args.metrics)
+        chosen = {k: v for k, v in report.pop("thresholds", {}).items() if k in THRESHOLDS[task]}
+        facts["thresholds"] = {**chosen, **args.thresholds}
+        if "score" in report and args.task != "corners":
+            facts["score"] = report["score"]
+        report.pop("score", None)
+        facts["metrics"] = report
+    if heights is None and args.pool and task != "sections":
+        heights = corner_height_moments(Path(args.pool))
+    export(model, args.out, contract_of(task, heights, settings.family, **facts))
     if args.weights:
-        halves = {k: v.half() if v.is_floating_point() else v for k, v in state["average"].items()}
+        halves = {k: v.half() if v.is_floating_point() else v for k, v in average.items()}
         with store.whole(args.weights) as temporary:
             torch.save({"average": halves, "settings": state["settings"]}, temporary)
     print(f"{args.out}: {state['step']} steps, {state['seconds'] / 60:.0f} min")

@@ -28,6 +28,7 @@ from kibs_steps.grid import Window
 from kibs_steps.learn import dataset
 from kibs_steps.models import runtime
 from kibs_steps.scene import Scene
+from kibs_steps.simulate import rendering
 from kibs_steps.truth import Truth
 
 SPLITS = ("training", "validation", "testing")
@@ -104,6 +105,7 @@ def section_sample(scene: Scene, sections: Truth, window: Window, unknown: NDArr
         labels=labels,
         roof=np.where(blank, dataset.UNKNOWN, labels > 0).astype(np.uint8),
         height=np.where(labels > 0, height, np.nan).astype(np.float32),
+        surface=np.where(labels > 0, rendering.ON_ROOF, dataset.UNKNOWN).astype(np.uint8),
         corners=place[shown].astype(np.float32),
         corner_heights=vertices.height[shown].astype(np.float32),
         corners_known=(~blank).astype(np.uint8),
@@ -122,6 +124,7 @@ def building_sample(
     return dataset.empty(rgb)._replace(
         labels=np.where(blank | building, -1, 0).astype(np.int32),
         roof=np.where(blank, dataset.UNKNOWN, building).astype(np.uint8),
+        surface=np.where(building & ~blank, rendering.ON_ROOF, dataset.UNKNOWN).astype(np.uint8),
         corners_known=(~(near | blank)).astype(np.uint8),
         geometry=geometry_of(scene),
     )
@@ -255,6 +258,8 @@ def main(argv: list[str] | None = None) -> None:
         "annotation": fingerprint.of_file(source, args.out / "fingerprints.json"),
         "split": {"rule": args.split, "seed": args.seed, "shares": SHARES, "tile": args.tile, "tiles": counts}
         | ({"square": args.square, "buffer": args.buffer} if by_blocks else {}),
+        "view": scene.view and [scene.view.azimuth, scene.view.elevation],
+        "sun": scene.sun and [scene.sun.azimuth, scene.sun.elevation],
         "corners": {
             "count": len(known),
             "mean_height": float(known.mean()) if len(known) else None,

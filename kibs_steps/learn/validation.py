@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from kibs_steps import cli, store
 from kibs_steps.blend import blend, rims
-from kibs_steps.learn import dataset
+from kibs_steps.learn import calibration, dataset
 from kibs_steps.models import contract as contracts
 from kibs_steps.models import heads, runtime
 
@@ -189,6 +189,21 @@ def best_thresholds(
     return {"roof": roof, "prominence": prominence}
 
 
+def score_weights(
+    raw: Sequence[dict[str, np.ndarray]], samples: Sequence[dataset.Sample], contract: dict[str, Any]
+) -> dict[str, float]:
+    """Weights of the sections' score (`learn.calibration`) on the samples; sections mostly on unknown ground say nothing."""
+    found_traits, hits = [], []
+    for maps, sample in zip(raw, samples, strict=True):
+        labels = heads.decode_sections(maps, contract).labels
+        if labels.any():
+            known = heads.mean_by_label(sample.labels >= 0, labels) > 0.5
+            found = heads.traits(labels, maps["roof"][0], maps["edge"][0], maps["distance"][0])
+            found_traits.append({name: value[known] for name, value in found.items()})
+            hits.append(calibration.right(labels, sample.labels)[known])
+    return calibration.weights(found_traits, hits)
+
+
 def judge_corners(
     model: contracts.Model,
     samples: Sequence[dataset.Sample],
@@ -252,7 +267,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", required=True, help="report, JSON")
     parser.add_argument("--pictures", help="folder for one picture per test set")
     parser.add_argument(
-        "--choose", action="store_true", help="first choose roof and prominence thresholds on these sets"
+        "--choose", action="store_true", help="first choose thresholds and the weights of the score on these sets"
     )
     args = parser.parse_args(argv)
     model = contracts.load(args.sections, "sections")
@@ -270,13 +285,12 @@ def main(argv: list[str] | None = None) -> None:
     report: dict[str, Any] = {}
     if args.choose:
         chosen = ("village", "simulated", "simulated_oblique")
-        report["thresholds"] = best_thresholds(
-            [maps for name in chosen for maps in raw_maps[name]],
-            [sample for name in chosen for sample in sets[name]],
-            model.contract,
-        )
+        maps = [maps for name in chosen for maps in raw_maps[name]]
+        samples = [sample for name in chosen for sample in sets[name]]
+        report["thresholds"] = best_thresholds(maps, samples, model.contract)
         model.contract["thresholds"].update(report["thresholds"])
-        print(report["thresholds"])
+        report["score"] = model.contract["score"] = score_weights(maps, samples, model.contract)
+        print(report["thresholds"], report["score"])
     for name, samples in sets.items():
         raw = raw_maps[name]
         found = [heads.decode_sections(maps, model.contract) for maps in raw]

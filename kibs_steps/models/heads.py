@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy import ndimage
+
+from kibs_steps.blend import rims
 
 PROMINENCE = 0.2  # of a section's summit, where the contract does not say
 SMOOTH = 0.5  # px: summits one pixel wide are noise
@@ -37,7 +38,8 @@ class Corners(NamedTuple):
 def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Sections:
     """Sections of one tile from the outputs of either head."""
     if contract["head"] == "dense":
-        return dense_sections(outputs["roof"][0], outputs["edge"][0], outputs["distance"][0], contract["thresholds"])
+        maps = (outputs["roof"][0], outputs["edge"][0], outputs["distance"][0])
+        return dense_sections(*maps, contract["thresholds"], contract.get("score"))
     return instance_sections(outputs, contract["tile"], contract["thresholds"])
 
 
@@ -50,25 +52,59 @@ def decode_corners(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> 
     return instance_corners(outputs, contract["heights"], contract["thresholds"])
 
 
-def dense_sections(roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, thresholds: dict[str, float]) -> Sections:
+def dense_sections(
+    roof: np.ndarray,
+    edge: np.ndarray,
+    distance: np.ndarray,
+    thresholds: dict[str, float],
+    score: dict[str, float] | None = None,
+) -> Sections:
     """Sections where the distance to the rim rises to a summit of its own, flooded over the roof (watershed).
 
     `roof`, `edge`, `distance` are (s, s) in 0–1. Of all summits of distance − edge those count that rise `prominence` above
     the pass to a higher one. Every roof area is at least one section. Sections under `min_area` px are given to the neighbour
-    they touch most, or dropped when alone.
+    they touch most, or dropped when alone. `score` are the weights of `traits` that tell how likely a section is right;
+    without them its score is its mean roof probability.
     """
     mask = roof > thresholds["roof"]
     if not mask.any():
         return Sections(np.zeros(roof.shape, np.int32), np.zeros(0, np.float32))
+    from scipy import ndimage
+
     level = ndimage.gaussian_filter((distance - edge).astype(np.float32), SMOOTH)
     basins = flood(summits(level, mask), mask, level)
     labels = joined_basins(basins, level, thresholds.get("prominence", PROMINENCE))
     labels = absorb_small(labels, int(thresholds["min_area"]))
-    return Sections(labels, mean_by_label(roof, labels))
+    if score is None:
+        return Sections(labels, mean_by_label(roof, labels))
+    found = traits(labels, roof, edge, distance)
+    logit = sum((score[name] * value for name, value in found.items()), start=np.float64(score["bias"]))
+    return Sections(labels, (1 / (1 + np.exp(-logit))).astype(np.float32))
+
+
+def traits(labels: np.ndarray, roof: np.ndarray, edge: np.ndarray, distance: np.ndarray) -> dict[str, np.ndarray]:
+    """What tells good sections 1…n from bad ones, (n,) each: area (log px), mean roof probability, mean edge on the rim and
+    inside, height of the summit, and the rim's length against that of a square of the same area."""
+    rim = rims(labels)
+    n = int(labels.max(initial=0))
+    area = np.bincount(labels.ravel(), minlength=n + 1)[1:]
+    length = np.bincount(labels[rim], minlength=n + 1)[1:]
+    summit = np.full(n + 1, -np.inf)
+    np.maximum.at(summit, labels.ravel(), (distance - edge).ravel())
+    return {
+        "log_area": np.log(np.maximum(area, 1)),
+        "roof": mean_by_label(roof, labels),
+        "rim": mean_by_label(edge, np.where(rim, labels, 0), n),
+        "inside": mean_by_label(edge, np.where(rim, 0, labels), n),
+        "summit": summit[1:],
+        "rim_length": length**2 / (16.0 * np.maximum(area, 1)),
+    }
 
 
 def summits(level: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Local maxima of `level` (s, s) among 8 neighbours of the mask, plateaus as one, labelled 1…n: one or more an area."""
+    from scipy import ndimage
+
     inside = np.where(mask, level, -np.inf)
     return ndimage.label(mask & (inside >= ndimage.maximum_filter(inside, size=3)), np.ones((3, 3)))[0]
 
@@ -92,6 +128,9 @@ def joined_basins(basins: np.ndarray, level: np.ndarray, prominence: float) -> n
         passes.append(np.column_stack([pair, np.minimum(level[a][differ], level[b][differ])]))
     passes = np.concatenate(passes)
     passes = passes[np.lexsort((passes[:, 1], passes[:, 0], -passes[:, 2]))]
+    # Where the highest pass between two basins does not join them no lower one does.
+    highest = np.unique(passes[:, :2], axis=0, return_index=True)[1]
+    passes = passes[np.sort(highest)]
     parent = np.arange(n + 1)
 
     def root(i: int) -> int:
@@ -143,9 +182,9 @@ def relabelled(labels: np.ndarray) -> np.ndarray:
     return new[inverse].reshape(labels.shape)
 
 
-def mean_by_label(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Mean of `values` over each label 1…n."""
-    n = int(labels.max(initial=0))
+def mean_by_label(values: np.ndarray, labels: np.ndarray, n: int | None = None) -> np.ndarray:
+    """Mean of `values` over each label 1…n, 0 where a label has no pixel; `n` is the greatest label if not given."""
+    n = int(labels.max(initial=0)) if n is None else n
     total = np.bincount(labels.ravel(), values.ravel().astype(np.float64), n + 1)
     count = np.bincount(labels.ravel(), minlength=n + 1)
     return (total / np.maximum(count, 1))[1:].astype(np.float32)
@@ -170,6 +209,8 @@ def instance_sections(outputs: dict[str, np.ndarray], size: int, thresholds: dic
 
 def pasted(box: np.ndarray, mask: np.ndarray, size: int) -> tuple[tuple[slice, slice], np.ndarray]:
     """A box's (x0, y0, x1, y1) window of the tile and the mask's probabilities there, bilinear."""
+    from scipy import ndimage
+
     x0, y0 = np.floor(np.maximum(box[:2], 0)).astype(int)
     x1, y1 = np.ceil(np.minimum(box[2:], size)).astype(int)
     x1, y1 = max(x1, x0 + 1), max(y1, y0 + 1)
@@ -177,7 +218,7 @@ def pasted(box: np.ndarray, mask: np.ndarray, size: int) -> tuple[tuple[slice, s
     col = (np.arange(x0, x1) + 0.5 - box[0]) / max(box[2] - box[0], 1e-3) * n - 0.5
     row = (np.arange(y0, y1) + 0.5 - box[1]) / max(box[3] - box[1], 1e-3) * n - 0.5
     grid = np.meshgrid(row, col, indexing="ij")
-    return (slice(y0, y1), slice(x0, x1)), ndimage.map_coordinates(mask, grid, order=1, mode="constant")
+    return (slice(y0, y1), slice(x0, x1)), ndimage.map_coordinates(mask, grid, order=1, mode="grid-constant")
 
 
 def height_moments(distribution: np.ndarray, heights: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -198,18 +239,25 @@ def dense_corners(
 
     `corner` (s, s), `offset` (2, s, s) px from the pixel's centre, `height` (B, s/k, s/k) for any stride k.
     """
-    peak = (corner >= thresholds["corner"]) & (corner >= ndimage.maximum_filter(corner, size=5, mode="constant"))
+    peak = (corner >= thresholds["corner"]) & (corner >= cv2.dilate(corner, np.ones((5, 5), np.uint8)))
     row, col = np.nonzero(peak)
     score = corner[row, col].astype(np.float64)
     x = col + 0.5 + offset[0, row, col]
     y = row + 0.5 + offset[1, row, col]
     k = corner.shape[0] / height.shape[1]
-    at = [np.clip(y / k - 0.5, 0, height.shape[1] - 1), np.clip(x / k - 0.5, 0, height.shape[2] - 1)]
-    distribution = (
-        np.stack([ndimage.map_coordinates(plane, at, order=1) for plane in height]) if len(row) else height[:, :0, 0]
-    )
-    mean, sigma = height_moments(distribution, heights)
+    mean, sigma = height_moments(bilinear(height, y / k - 0.5, x / k - 0.5), heights)
     return Corners(x.astype(np.float64), y.astype(np.float64), mean, sigma, score)
+
+
+def bilinear(maps: np.ndarray, row: np.ndarray, col: np.ndarray) -> np.ndarray:
+    """Values (B, n) of maps (B, rows, cols) at places between pixel centres; beyond the outermost ones the edge holds."""
+    row, col = np.clip(row, 0, maps.shape[1] - 1), np.clip(col, 0, maps.shape[2] - 1)
+    top, left = row.astype(np.int64), col.astype(np.int64)
+    below, right = np.minimum(top + 1, maps.shape[1] - 1), np.minimum(left + 1, maps.shape[2] - 1)
+    down, along = row - top, col - left
+    above = maps[:, top, left] * (1 - along) + maps[:, top, right] * along
+    under = maps[:, below, left] * (1 - along) + maps[:, below, right] * along
+    return above * (1 - down) + under * down
 
 
 def instance_corners(outputs: dict[str, np.ndarray], heights: dict[str, Any], thresholds: dict[str, float]) -> Corners:

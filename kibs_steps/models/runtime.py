@@ -1,10 +1,13 @@
 """Running a model: one onnxruntime session, the same answer on every machine's core count.
 
-Threads are an argument, never derived from the machine, because sums in another order differ in their last bits.
+Threads and provider (what computes: the processor, a GPU) are arguments, never derived from the machine, because sums in
+another order differ in their last bits.
 """
 
 from __future__ import annotations
 
+import argparse
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,9 +15,36 @@ from typing import NamedTuple
 import numpy as np
 
 from kibs_steps import store
+from kibs_steps.errors import KibsError
 from kibs_steps.models import contract as contracts
 
+GPU_MEMORY = 2 * 2**30  # bytes a job may take of a GPU, which several jobs share
+PROVIDERS: dict[str, tuple[str, str, dict[str, object]]] = {  # onnxruntime's name, the package that has it, its options
+    "cpu": ("CPUExecutionProvider", "onnxruntime", {}),
+    "cuda": (
+        "CUDAExecutionProvider",
+        "onnxruntime-gpu",
+        {
+            "gpu_mem_limit": GPU_MEMORY,
+            "arena_extend_strategy": "kSameAsRequested",
+            "cudnn_conv_algo_search": "HEURISTIC",  # the fastest of one run is not that of the next, and gives other bits
+            "use_tf32": 0,
+        },
+    ),
+    "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino", {"device_type": "CPU", "precision": "FP32"}),
+}
+
 Network = Callable[[np.ndarray], dict[str, np.ndarray]]  # image (s, s, 3) uint8 -> named maps, batch axis dropped
+
+
+class ProviderMissing(KibsError):
+    """An onnxruntime without the provider that is asked for."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of a step that runs a model: `--provider`, `--threads`."""
+    parser.add_argument("--provider", choices=list(PROVIDERS), default="cpu", help="where onnxruntime computes")
+    parser.add_argument("--threads", type=int, default=1, help="cores of one session")
 
 
 def geometry_vector(view: tuple[float, float] | None, sun: tuple[float, float] | None, gsd: float) -> np.ndarray:
@@ -33,20 +63,33 @@ def geometry_vector(view: tuple[float, float] | None, sun: tuple[float, float] |
     return vector
 
 
-def open_network(model: contracts.Model, geometry: np.ndarray, threads: int = 1) -> Network:
+def open_network(model: contracts.Model, geometry: np.ndarray, provider: str = "cpu", threads: int = 1) -> Network:
     """A function from an image (s, s, 3) uint8 to the model's named outputs without their batch axis.
 
     Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged; those
     that want tiles `upright` see the one view in which roofs lean up.
-    `geometry` (1, 6) goes to models whose contract asks for it. CPU provider; `threads` intra-op threads.
+    `geometry` (1, 6) goes to models whose contract asks for it. `provider` is a key of `PROVIDERS`; `threads` within an
+    operator. Raises `ProviderMissing`.
     """
     import onnxruntime as ort
 
+    name, package, settings = PROVIDERS[provider]
+    if name not in ort.get_available_providers():
+        raise ProviderMissing(
+            f"provider={provider}: this onnxruntime has {', '.join(ort.get_available_providers())}: install {package} in its "
+            "place, or set provider=cpu"
+        )
+    if provider == "openvino":
+        settings = {**settings, "num_of_threads": threads}
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    session = ort.InferenceSession(model.path.read_bytes(), options, providers=["CPUExecutionProvider"])
+    session = ort.InferenceSession(model.path.read_bytes(), options, providers=[(name, settings)])
+    if session.get_providers()[0] != name:
+        raise ProviderMissing(
+            f"provider={provider}: onnxruntime fell back to {session.get_providers()[0]}: check its drivers"
+        )
     names = [o.name for o in session.get_outputs()]
     wants_geometry = bool(model.contract.get("geometry_input"))
     dense = model.contract["head"] == "dense"
@@ -58,11 +101,9 @@ def open_network(model: contracts.Model, geometry: np.ndarray, threads: int = 1)
         outputs = session.run(names, feed)
         return {name: (value[0] if dense else value) for name, value in zip(names, outputs, strict=True)}
 
-    views = (
-        [upright(geometry)]
-        if model.contract.get("upright")
-        else FLIPS[: model.contract.get("flips", 1) if dense else 1]
-    )
+    if not dense:
+        return lambda rgb: run(rgb, geometry)
+    views = [upright(geometry)] if model.contract.get("upright") else FLIPS[: model.contract.get("flips", 1)]
 
     def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
         total: dict[str, np.ndarray] = {}
@@ -126,9 +167,16 @@ def upright(geometry: np.ndarray) -> Flip:
 
 
 def from_record(path: str | Path, task: str) -> contracts.Model:
-    """The model named in a workflow's `models/{task}.json`; a file that changed since is refused."""
+    """The model named in a workflow's `models/{task}.json`, with the contract that was checked when it was written.
+
+    A file that changed since is refused.
+    """
     record = store.read_json(path)
-    model = contracts.load(record["file"], task)
-    if model.sha256 != record["sha256"]:
+    model = contracts.Model(Path(record["file"]), record["sha256"], record["contract"])
+    if not model.path.is_file():
+        raise contracts.NotAModel(f"{model.path} is gone: put it back, or run the same command with other models")
+    if hashlib.sha256(model.path.read_bytes()).hexdigest() != model.sha256:
         raise contracts.ContractMismatch(f"{model.path} changed while the workflow ran: run the same command again")
+    if model.contract["task"] not in (task, "both"):
+        raise contracts.ContractMismatch(f"{path} is of a model of {model.contract['task']}, used here for {task}")
     return model

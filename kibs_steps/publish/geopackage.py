@@ -8,6 +8,8 @@ QGIS read too. Rows are in order of their ids and every date is `DATE`, so the s
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 
 import pyarrow as pa
@@ -42,6 +44,8 @@ SECTION_COLUMNS = (
     "score",
     "area",
     "split",
+    "sigma_along",
+    "sigma_across",
 )
 BUILDING_COLUMNS = (
     "building_id",
@@ -57,15 +61,23 @@ BUILDING_COLUMNS = (
     "volume",
     "footprint_area",
     "roof_type",
+    "height_sigma",
+    "position_sigma",
+    "faithful",
 )
 FOOTPRINT_COLUMNS = ("building_id", "lod", "ground_z", "height", "footprint_area")
 CORNER_COLUMNS = ("section_id", "height", "sigma", "score")
 
 
-def read(paths: list[str], order: list[str]) -> pa.Table:
-    """The tables of all blocks as one, sorted."""
-    table = pa.concat_tables([store.read_table(path) for path in paths], promote_options="permissive")
-    return table.sort_by([(name, "ascending") for name in order])
+Tables = Callable[[], Iterator[pa.Table]]  # a table in parts, as often as it is asked for
+
+
+def rows(tables: Tables, make: Callable[[pa.Table], pa.Table]) -> pa.RecordBatchReader:
+    """What `make` makes of each part of a table, as a stream: only a part is in memory."""
+    made = map(make, tables())
+    first = next(made)
+    batches = (batch for part in chain([first], made) for batch in part.cast(first.schema).to_batches())
+    return pa.RecordBatchReader.from_batches(first.schema, batches)
 
 
 def layer(table: pa.Table, columns: tuple[str, ...], geometry: pa.Array | pa.ChunkedArray) -> pa.Table:
@@ -106,19 +118,29 @@ def blocks(tiling: Tiling, grid: Grid, known: dict[str, dict[str, str]]) -> pa.T
                     names=list(kinds))  # fmt: skip
 
 
-def layers(sections: pa.Table, solids: pa.Table, corners: pa.Table) -> dict[str, tuple[str, pa.Table]]:
+def points(corners: pa.Table) -> pa.Table:
+    """Layer `corners`."""
+    shapes = shapely.points(*(corners[name].to_numpy() for name in ("x", "y", "z")))
+    return layer(corners, CORNER_COLUMNS, pa.array(shapely.to_wkb(shapes), pa.binary()))
+
+
+def layers(sections: Tables, solids: Tables, corners: Tables) -> dict[str, tuple[str, pa.RecordBatchReader]]:
     """The layers that follow from the tables: geometry type and rows by name, after DESIGN's interface."""
-    points = shapely.points(*(corners[name].to_numpy() for name in ("x", "y", "z")))
     return {
-        "buildings": ("MultiPolygon", layer(solids, BUILDING_COLUMNS, outlines(solids["outline"]))),
-        "footprints": ("Polygon", footprints(solids)),
-        "roof_sections": ("Polygon Z", layer(sections, SECTION_COLUMNS, sections["outline_map"])),
-        "roof_sections_image": ("Polygon Z", layer(sections, SECTION_COLUMNS, sections["outline_seen"])),
-        "corners": ("Point Z", layer(corners, CORNER_COLUMNS, pa.array(shapely.to_wkb(points), pa.binary()))),
+        "buildings": ("MultiPolygon", rows(solids, lambda t: layer(t, BUILDING_COLUMNS, outlines(t["outline"])))),
+        "footprints": ("Polygon", rows(solids, footprints)),
+        "roof_sections": ("Polygon Z", rows(sections, lambda t: layer(t, SECTION_COLUMNS, t["outline_map"]))),
+        "roof_sections_image": ("Polygon Z", rows(sections, lambda t: layer(t, SECTION_COLUMNS, t["outline_seen"]))),
+        "corners": ("Point Z", rows(corners, points)),
     }
 
 
-def write(path: str | Path, content: dict[str, tuple[str, pa.Table]], crs: str, metadata: dict[str, str]) -> None:
+def write(
+    path: str | Path,
+    content: dict[str, tuple[str, pa.Table | pa.RecordBatchReader]],
+    crs: str,
+    metadata: dict[str, str],
+) -> None:
     """Write layers (geometry type, rows with WKB in `geom`) and their styles to a GeoPackage, whole."""
     import pyogrio
     from pyogrio.raw import write_arrow
@@ -126,9 +148,9 @@ def write(path: str | Path, content: dict[str, tuple[str, pa.Table]], crs: str, 
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": DATE})
     with store.whole(path) as temporary:
         temporary.unlink()
-        for name, (kind, rows) in content.items():
+        for name, (kind, features) in content.items():
             write_arrow(
-                rows,
+                features,
                 temporary,
                 layer=name,
                 driver="GPKG",
@@ -165,10 +187,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", required=True, help="out: city.gpkg")
     args = parser.parse_args(argv)
     scene = scenes.read(args.scene)
-    content = layers(
-        read(args.sections, ["section_id"]),
-        read(args.solids, ["building_id"]),
-        read(args.corners, ["section_id", "x", "y", "z"]),
+    content: dict[str, tuple[str, pa.Table | pa.RecordBatchReader]] = layers(
+        lambda: store.merged(args.sections, ["section_id"]),
+        lambda: store.merged(args.solids, ["building_id"]),
+        lambda: store.merged(args.corners, ["section_id", "x", "y", "z"]),
     )
     known = store.read_json(args.blocks) if args.blocks else {}
     content["blocks"] = ("Polygon", blocks(Tiling(args.tile, args.margin, args.block), scene.grid, known))
@@ -177,4 +199,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -15,13 +15,24 @@ import shapely
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 
-from kibs_steps import cli, picture, store
+from kibs_steps import cli, picture, store, terrain
 from kibs_steps import scene as scenes
 from kibs_steps.picture import FINER
 from kibs_steps.scene import Scene
 
 LONGEST = 1200  # px: longer side of a panel
 LIGHT = np.array([-0.5, 0.5, 0.7])  # towards the lamp of the shaded map: north-west, as maps have it
+COLUMNS = [
+    "section_id",
+    "building_id",
+    "outline",
+    "outline_map",
+    "slope",
+    "azimuth",
+    "plane_a",
+    "plane_b",
+    "height_mean",
+]
 SHADOW = np.array([0.45, 0.45])  # m east and south per m of height
 
 
@@ -49,8 +60,8 @@ def terrain_shade(scene: Scene, size: tuple[int, int], scale: float) -> NDArray[
     step = 4
     cols, rows = np.meshgrid(np.arange(0, size[0] + step, step), np.arange(0, size[1] + step, step))
     place = scene.grid.to_map(np.stack([cols, rows], axis=-1).reshape(-1, 2) / scale)
-    heights = scene.terrain(scene.grid.bounds)(place).reshape(cols.shape)
     metres = step * scene.grid.gsd / scale
+    heights = terrain.read(scene.folder / "dtm.tif", scene.grid.bounds, step=metres)(place).reshape(cols.shape)
     down, along = np.gradient(heights, metres)
     base = np.full((*heights.shape, 3), (232, 231, 225), np.uint8)
     relief = Image.fromarray(shaded(base, 2 * along, -2 * down))
@@ -149,10 +160,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
     parser.add_argument("--out", required=True, help="out: preview.png")
     args = parser.parse_args(argv)
-    tables = [store.read_table(path) for path in args.sections]
+    tables = [store.read_table(path, COLUMNS) for path in args.sections]
     sections = pa.concat_tables(tables, promote_options="permissive").sort_by("section_id")
     picture.write(args.out, preview(scenes.read(args.scene), sections))
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -26,6 +26,7 @@ from kibs_steps import cli, store, view, zbuffer
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid, Window
+from kibs_steps.planes import middle_of
 from kibs_steps.publish import licences
 from kibs_steps.scene import Scene
 from kibs_steps.view import Plane
@@ -82,7 +83,8 @@ def shown(sections: Sections, scene: Scene, window: Window) -> tuple[NDArray[np.
     rings, owner = shapely.get_rings(shapely.from_wkb(near.outlines), return_index=True)
     points, ring = shapely.get_coordinates(rings, return_index=True)
     image = scene.grid.to_map(points)
-    _, z = view.ray_meets_plane(image, Plane(*near.planes[owner[ring]].T), scene.lean, projected_on)
+    lean = scene.leans(middle_of(shapely.from_wkb(near.outlines), scene))
+    _, z = view.ray_meets_plane(image, Plane(*near.planes[owner[ring]].T), lean[owner[ring]], projected_on)
     lifted = np.column_stack([image + z[:, None] * scene.lean, z])
     parts = [part[:-1] for part in np.split(lifted, np.flatnonzero(np.diff(ring)) + 1)]
     first = np.searchsorted(owner, np.arange(len(near.ids) + 1))
@@ -92,7 +94,7 @@ def shown(sections: Sections, scene: Scene, window: Window) -> tuple[NDArray[np.
     rows, cols = np.nonzero(face >= 0)
     section = face[rows, cols]
     image = frame.to_map(np.column_stack([cols, rows]) + 0.5)
-    standing, z = view.ray_meets_plane(image, Plane(*near.planes[section].T), scene.lean, projected_on)
+    standing, z = view.ray_meets_plane(image, Plane(*near.planes[section].T), lean[section], projected_on)
     labels[rows, cols] = near.ids[section]
     heights[rows, cols] = z - terrain(standing)
     return labels, heights
@@ -159,4 +161,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

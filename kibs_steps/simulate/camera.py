@@ -40,7 +40,7 @@ def camera(rng: np.random.Generator) -> Camera:
         chroma=float(rng.choice([0.0, rng.uniform(0.8, 3.0)])),
         fringe=tuple(rng.normal(0, 0.5, 2)) if rng.random() < 0.4 else (0.0, 0.0),
         sharpen=float(rng.choice([0.0, rng.uniform(0.2, 1.2)])),
-        gamma=rng.uniform(1.0, 2.3),
+        gamma=rng.uniform(1.15, 2.3),
         dark=float(rng.choice([0.0005, rng.uniform(0.001, 0.03)])),
         bright=float(rng.choice([0.0005, rng.uniform(0.001, 0.03)])),
         top=rng.uniform(0.6, 1.02),

@@ -6,16 +6,20 @@ ground paints (drawn in order, later over earlier) and materials.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from kibs_steps.simulate import blocks, roofs
-from kibs_steps.simulate.site import City, Site, pick
+from kibs_steps.simulate import blocks, draped, roofs
+from kibs_steps.simulate.draped import House
+from kibs_steps.simulate.outdoors import add_decoys, street
+from kibs_steps.simulate.pieces import City, pick
+from kibs_steps.simulate.site import Site
 from kibs_steps.simulate.surfaces import palette
 from kibs_steps.terrain import Terrain
 
-STYLES = ("suburb", "rows", "village", "perimeter", "centre", "industry", "farm", "desert", "estate")
+STYLES = ("suburb", "rows", "village", "perimeter", "centre", "industry", "farm", "desert", "estate", "harbour")
 BLOCKS = {  # block length and depth, road width: least and most (m)
     "suburb": (80, 170, 46, 78, 5, 9),
     "rows": (70, 150, 38, 80, 5, 10),
@@ -26,13 +30,15 @@ BLOCKS = {  # block length and depth, road width: least and most (m)
     "farm": (90, 220, 80, 200, 3, 5),
     "desert": (50, 110, 30, 60, 4, 10),
     "estate": (90, 200, 70, 130, 6, 12),
+    "harbour": (80, 200, 70, 150, 6, 12),
     "mixed": (60, 130, 50, 90, 5, 14),
     "town": (70, 150, 45, 85, 5, 10),
 }
 MIXTURES = {  # shares of the styles; a town is detached houses and rows, some old core, some works
-    "mixed": (0.2, 0.17, 0.12, 0.15, 0.1, 0.11, 0.04, 0.05, 0.06),
-    "town": (0.46, 0.26, 0.14, 0.0, 0.0, 0.1, 0.04, 0.0, 0.0),
+    "mixed": (0.2, 0.17, 0.12, 0.15, 0.1, 0.1, 0.04, 0.05, 0.06, 0.01),
+    "town": (0.46, 0.26, 0.14, 0.0, 0.0, 0.1, 0.04, 0.0, 0.0, 0.0),
 }
+DETACHED = ("suburb", "rows", "village", "farm")  # where photographed houses may stand
 NATIVE = {  # where a style is at home; elsewhere now and then
     "rows": ("holland", "britain", "north_france", "germany"),
     "town": ("north_france", "germany"),
@@ -49,8 +55,12 @@ def procedural(
     terrain: Terrain,
     style: str,
     origin: tuple[float, float] = (0.0, 0.0),
+    houses: Sequence[House] = (),
 ) -> City:
-    """A city of one of `STYLES` or `MIXTURES` over `width`×`height` m whose lower-left corner is `origin` (map metres)."""
+    """A city of one of `STYLES` or `MIXTURES` over `width`×`height` m whose lower-left corner is `origin` (map metres).
+
+    With photographed `houses` most blocks of detached houses are made of them.
+    """
     area = (origin[0], origin[1], origin[0] + width, origin[1] + height)
     native = NATIVE.get(style)
     country = pick(rng, native) if native and rng.random() < 0.75 else None
@@ -59,11 +69,11 @@ def procedural(
     site = Site(rng, terrain, kit, area, float(curved))
     whole = np.array(roofs.rectangle(area[0] - 50, area[1] - 50, area[2] + 50, area[3] + 50))
     site.paint(whole, pick(rng, ["lawn", "rough", "soil", "pavement"]))
-    lay_out(site, style)
-    return City(site.faces, site.paints, kit.materials)
+    lay_out(site, style, houses)
+    return City(site.faces, site.paints, kit.materials, site.photographs)
 
 
-def lay_out(site: Site, style: str) -> None:
+def lay_out(site: Site, style: str, houses: Sequence[House] = ()) -> None:
     """Streets over a site's whole area and what fills the blocks between them, where nothing stands yet."""
     rng = site.rng
     width, height = site.area[2] - site.area[0], site.area[3] - site.area[1]
@@ -80,22 +90,26 @@ def lay_out(site: Site, style: str) -> None:
 
     ss, ts = cuts(long0, long1), cuts(deep0, deep1)
     for (_, a), (b, _) in pairwise(ss):
-        blocks.street(site, a, ts[0][0], b, ts[-1][1])
+        street(site, a, ts[0][0], b, ts[-1][1])
     for (_, a), (b, _) in pairwise(ts):
-        blocks.street(site, ss[0][0], a, ss[-1][1], b)
+        street(site, ss[0][0], a, ss[-1][1], b)
     decoys = pick(rng, [0.0, 0.5])
     green = 0.12 if style != "farm" else 0.02
-    corner = 0.5 * np.hypot(width, height)
     for s0, s1 in ss:
         for t0, t1 in ts:
-            x, y = site.at(min(max(0.0, s0), s1), min(max(0.0, t0), t1))
-            if np.hypot(x - site.middle[0], y - site.middle[1]) > corner + 25:
+            corners = np.array([site.at(s, t) for s in (s0, (s0 + s1) / 2, s1) for t in (t0, t1)])
+            if (corners.max(0) + 10 < site.area[:2]).any() or (corners.min(0) - 10 > site.area[2:]).any():
                 continue
             name = style
             if style in MIXTURES:
                 name = str(rng.choice(STYLES, p=MIXTURES[style]))
             elif rng.random() < 0.1:
                 name = pick(rng, STYLES)
-            blocks.FILL["park" if rng.random() < green else name](site, s0, t0, s1, t1)
+            if rng.random() < green:
+                blocks.FILL["park"](site, s0, t0, s1, t1)
+            elif houses and name in DETACHED and rng.random() < 0.85:
+                draped.fill(site, houses, s0, t0, s1, t1)
+            else:
+                blocks.FILL[name](site, s0, t0, s1, t1)
             if rng.random() < decoys:
-                blocks.add_decoys(site, s0, t0, s1, t1)
+                add_decoys(site, s0, t0, s1, t1)

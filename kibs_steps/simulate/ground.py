@@ -13,8 +13,10 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from kibs_steps.simulate import roofs
-from kibs_steps.simulate.blocks import FILL, street
-from kibs_steps.simulate.site import CELL, TREE, Place, Site, pick
+from kibs_steps.simulate.blocks import FILL
+from kibs_steps.simulate.outdoors import street
+from kibs_steps.simulate.pieces import TREE, Place, pick
+from kibs_steps.simulate.site import CELL, Site
 
 EDGE = 60  # cells of the raster beyond the site's area, each side
 

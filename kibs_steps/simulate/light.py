@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from kibs_steps import zbuffer
-from kibs_steps.simulate.site import ROOF, TREE, WALL, Face, Paint
+from kibs_steps.simulate.pieces import ROOF, TREE, WALL, Face, Paint
 from kibs_steps.simulate.surfaces import Material
 
 SIDE = 512  # samples of the noise, 0.25 m each

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kibs_steps.simulate import ground, roofs
+from kibs_steps.simulate import furniture, ground, roofs
 from kibs_steps.simulate.city import lay_out
 from kibs_steps.simulate.citymodel import Building, CityModel
-from kibs_steps.simulate.site import ROOF, WALL, City, Face, Place, Site, pick
+from kibs_steps.simulate.pieces import ROOF, WALL, City, Face, Place, pick
+from kibs_steps.simulate.site import Site
 from kibs_steps.simulate.surfaces import palette
 from kibs_steps.terrain import Terrain
 
@@ -158,7 +159,7 @@ def _stand(
             Face(place.put(ring), tuple(place.put(h) for h in holes), ROOF, section, number, material, tint)
         )
         if section and not holes and _convex(axes.ring):
-            site.furnish(place, ring, number, material, tint, wall, paint)
+            furniture.furnish(site, place, ring, number, material, tint, wall, paint)
         found = site.cells(place, outline)
         if found:
             site.taken[found[0]] |= found[1]

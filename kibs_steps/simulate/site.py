@@ -1,6 +1,5 @@
 """A city being built: its faces, ground paints and materials, and what may stand there.
 
-A **section** is one planar part of a roof, numbered from 1; what lies on a section (dormer, chimney, solar panel) is none.
 Streets form a grid (coordinates s, t in m) that is bent and turned as a whole, so plots stay simple
 while streets curve. A raster of occupied ground keeps buildings from standing in each other.
 
@@ -10,106 +9,17 @@ In: a random generator, a terrain, a palette, an area in map metres. Out: lists 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import lru_cache
-from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 
-from kibs_steps.simulate import roofs
+from kibs_steps.simulate import furniture, roofs
+from kibs_steps.simulate.pieces import CAR, OBJECT, ROOF, TREE, WALL, Face, Paint, Photograph, Place, crowns, pick
 from kibs_steps.simulate.roofs import Wing
-from kibs_steps.simulate.surfaces import Material, Palette
+from kibs_steps.simulate.surfaces import Palette
 from kibs_steps.terrain import Terrain
 
-ROOF, WALL, TREE, CAR, CLUTTER, OBJECT = range(6)  # kinds of faces; CLUTTER stands on a roof, OBJECT on the ground
 CELL = 0.5  # m: of the raster of occupied ground
-
-Option = TypeVar("Option")
-
-
-def pick(rng: np.random.Generator, options: Sequence[Option]) -> Option:
-    """One of several options, all equally likely."""
-    return options[int(rng.random() * len(options))]
-
-
-class Face(NamedTuple):
-    """A planar polygon: ring (n, 3) and holes, map metres, absolute z, counter-clockwise seen from outside."""
-
-    ring: np.ndarray
-    holes: tuple[np.ndarray, ...] = ()
-    kind: int = OBJECT
-    section: int = 0
-    building: int = 0
-    material: int = 0
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-class Paint(NamedTuple):
-    """A polygon (n, 2) map metres of one material on the ground; `angle` (rad) of its texture's u axis."""
-
-    ring: np.ndarray
-    material: int
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    angle: float = 0.0
-
-
-class City(NamedTuple):
-    """Faces, ground paints and the materials both index."""
-
-    faces: list[Face]
-    paints: list[Paint]
-    materials: list[Material]
-
-
-class Place(NamedTuple):
-    """Where a building's own frame stands: position (m), angle of its x axis (rad), base (m absolute)."""
-
-    x: float
-    y: float
-    angle: float
-    base: float = 0.0
-
-    def put(self, ring: np.ndarray) -> np.ndarray:
-        """A ring (n, 2 or 3) of the building's frame in map metres."""
-        c, s = math.cos(self.angle), math.sin(self.angle)
-        out = np.array(ring, float)
-        out[:, 0] = self.x + c * ring[:, 0] - s * ring[:, 1]
-        out[:, 1] = self.y + s * ring[:, 0] + c * ring[:, 1]
-        if out.shape[1] == 3:
-            out[:, 2] += self.base
-        return out
-
-
-@lru_cache(maxsize=16)
-def crowns(count: int) -> list[np.ndarray]:
-    """A dozen crowns of `count` tilted leafy discs (count, 8, 3), radius 1, from −1 to 1 high; 0: conifers."""
-    rng = np.random.default_rng(count)
-    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
-    made = []
-    for _ in range(12):
-        if count:
-            direction = rng.normal(size=(count, 3))
-            direction[:, 2] = np.abs(direction[:, 2]) - 0.2
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            direction[0] = (0, 0, -0.3)  # a wide one below closes the crown
-            centre = direction * [0.62, 0.62, 0.8]
-            size = rng.uniform(0.38, 0.62, count)
-            size[0] = 0.85
-            normal = direction * [0.8, 0.8, 1.0] + [0, 0, 0.55]
-        else:
-            share = np.array([0.0, 0.3, 0.58, 0.85])
-            centre = np.column_stack([0 * share, 0 * share, share])
-            size = 1 - 0.85 * share
-            normal = rng.normal(0, 0.15, (4, 3)) + np.array([0, 0, 1])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        side = np.cross(normal, [0.0, 1.0, 0.0])
-        side /= np.linalg.norm(side, axis=1, keepdims=True)
-        other = np.cross(normal, side)
-        reach = size[:, None, None] * rng.uniform(0.75, 1.15, (len(size), 8, 1))
-        spokes = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * other[:, None]
-        made.append(centre[:, None] + reach * spokes)
-    return made
 
 
 class Site:
@@ -126,6 +36,7 @@ class Site:
         self.rng, self.terrain, self.kit, self.area = rng, terrain, kit, area
         self.faces: list[Face] = []
         self.paints: list[Paint] = []
+        self.photographs: list[Photograph] = []
         self.sections = 0
         self.buildings = 0
         self.level = bool(np.ptp(terrain.heights) == 0)
@@ -275,142 +186,19 @@ class Site:
             self.sections += 1
             own = self.tint(0.03)
             tint = (common[0] * own[0], common[1] * own[1], common[2] * own[2])
-            hole = self._penthouse(place, ring, roof, wall, number, self.sections) if parapet and furnish else ()
+            hole = (
+                furniture.penthouse(self, place, ring, roof, wall, number, self.sections) if parapet and furnish else ()
+            )
             self.faces.append(
                 Face(place.put(ring), hole, ROOF, self.sections if not hole else self.sections - 1, number, roof, tint)
             )
             if parapet:
-                self._parapet(place, ring, parapet, number, wall, paint)
+                furniture.parapet(self, place, ring, parapet, number, wall, paint)
             if furnish:
-                self.furnish(place, ring, number, roof, tint, wall, paint)
+                furniture.furnish(self, place, ring, number, roof, tint, wall, paint)
         for quad in roofs.walls(rings, overhang):
             self.faces.append(Face(place.put(quad), (), WALL, 0, number, wall, paint))
         return number
-
-    def _penthouse(
-        self, place: Place, ring: np.ndarray, roof: int, wall: int, number: int, host: int
-    ) -> tuple[np.ndarray, ...]:
-        """Sometimes a storey set back on a flat roof: a section of its own, and a hole in the one below."""
-        rng = self.rng
-        axes = roofs.frame_of(ring)
-        size = axes.ring.max(0)
-        if axes.rise > 0.01 or len(ring) != 4 or size.min() < 9 or rng.random() > 0.3:
-            return ()
-        u0, v0 = size * rng.uniform(0.12, 0.4, 2)
-        u1, v1 = size - size * rng.uniform(0.12, 0.4, 2)
-        if not axes.holds(u0, v0, u1, v1) or (u1 - u0) * (v1 - v0) < 12:
-            return ()
-        foot = roofs.slab(axes, u0, v0, u1, v1, 0.0)
-        top, sides = roofs.prism(foot[:, :2], ring[0, 2], ring[0, 2] + rng.uniform(2.2, 3.6))
-        self.sections += 1
-        self.faces.append(Face(place.put(top), (), ROOF, self.sections, number, roof, self.tint(0.1)))
-        self.faces += [Face(place.put(side), (), WALL, 0, number, wall, self.tint(0.03)) for side in sides]
-        return (place.put(foot),)
-
-    def _on(self, place: Place, rings: list[np.ndarray], number: int, material: int, tint: float = 0.06) -> None:
-        shade = self.tint(tint)
-        self.faces += [Face(place.put(ring), (), CLUTTER, 0, number, material, shade) for ring in rings]
-
-    def _parapet(
-        self,
-        place: Place,
-        ring: np.ndarray,
-        height: float,
-        number: int,
-        wall: int,
-        tint: tuple[float, float, float],
-    ) -> None:
-        after = np.roll(ring, -1, axis=0)
-        edge = (after - ring)[:, :2]
-        inward = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
-        before = np.roll(inward, 1, axis=0)
-        shift = 0.28 * (inward + before) / np.maximum(1 + (inward * before).sum(1), 0.2)[:, None]
-        inner = ring.copy()
-        inner[:, :2] += shift
-        top, low_outer = ring + np.array([0, 0, height]), ring
-        top_inner = inner + np.array([0, 0, height])
-        cap = self.kit.draw(self.rng, "wall") if self.rng.random() < 0.4 else wall
-        for i in range(len(ring)):
-            j = (i + 1) % len(ring)
-            quads = [[top[i], top[j], top_inner[j], top_inner[i]], [low_outer[i], low_outer[j], top[j], top[i]]]
-            quads.append([inner[j], inner[i], top_inner[i], top_inner[j]])
-            self.faces += [Face(place.put(np.array(q)), (), CLUTTER, 0, number, cap, tint) for q in quads]
-
-    def furnish(
-        self,
-        place: Place,
-        ring: np.ndarray,
-        number: int,
-        roof: int,
-        tint: tuple[float, float, float],
-        wall: int,
-        paint: tuple[float, float, float],
-    ) -> None:
-        """Dormers, skylights, solar panels and chimneys on slopes; boxes, panels and lights on flat roofs."""
-        rng = self.rng
-        axes = roofs.frame_of(ring)
-        width, depth = axes.ring.max(0)
-        if width * depth < 14 or axes.rise > 1.6:
-            return
-        much = self.furnished
-        draw = self.kit.draw
-        if axes.rise > 0.12:
-            if rng.random() < self.solar and width > 3:
-                w, d = min(width * rng.uniform(0.3, 0.9), 12), depth * rng.uniform(0.35, 0.8)
-                u, v = rng.uniform(0, width - w), rng.uniform(0.2, 0.8) * (depth - d)
-                if axes.holds(u, v, u + w, v + d):
-                    self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.1)], number, draw(rng, "solar"))
-                    return
-            if axes.rise > 0.45 and width > 4 and rng.random() < 0.45 * much:
-                gable, w, h = rng.random() < 0.5, rng.uniform(1.2, 2.6), rng.uniform(0.9, 1.6)
-                count = int(rng.integers(1, max(2, int(width / 3.5))))
-                v = rng.uniform(0.1, 0.35) * depth
-                for i in range(count):
-                    made = roofs.dormer(axes, width * (i + 0.5) / count, v, w, h, gable)
-                    if made:
-                        self.faces += [Face(place.put(r), (), CLUTTER, 0, number, roof, tint) for r in made[0]]
-                        self.faces += [Face(place.put(r), (), CLUTTER, 0, number, wall, paint) for r in made[1]]
-            elif rng.random() < 0.6 * much:
-                for _ in range(int(rng.integers(1, 4))):
-                    u, v, w = rng.uniform(0.1, 0.85) * width, rng.uniform(0.2, 0.7) * depth, rng.uniform(0.6, 1.2)
-                    if axes.holds(u, v, u + w, v + 1.3 * w):
-                        self._on(
-                            place,
-                            [roofs.slab(axes, u, v, u + w, v + 1.3 * w, 0.05)],
-                            number,
-                            draw(rng, "skylight"),
-                        )
-            if rng.random() < 0.5 * much + 0.1:
-                u, v, w = rng.uniform(0.1, 0.85) * width, rng.uniform(0.55, 0.9) * depth, rng.uniform(0.5, 1.0)
-                if axes.holds(u, v, u + w, v + 0.6):
-                    foot = roofs.slab(axes, u, v, u + w, v + 0.6, 0.0)
-                    top, sides = roofs.prism(
-                        foot[:, :2], float(foot[:, 2].min()), float(foot[:, 2].max()) + rng.uniform(0.4, 1.4)
-                    )
-                    self._on(place, [top, *sides], number, draw(rng, "chimney"))
-            return
-        count = rng.poisson(min(width * depth / 90, 14) * 1.2 * much)
-        for _ in range(count):
-            w, d = rng.uniform(0.7, 3.2, 2)
-            u, v = rng.uniform(0.5, max(width - w, 0.6)), rng.uniform(0.5, max(depth - d, 0.6))
-            if not axes.holds(u, v, u + w, v + d):
-                continue
-            foot = roofs.slab(axes, u, v, u + w, v + d, 0.0)
-            if rng.random() < 0.3:
-                self._on(place, [roofs.slab(axes, u, v, u + w, v + d, 0.15)], number, draw(rng, "skylight"))
-            else:
-                top, sides = roofs.prism(
-                    foot[:, :2], float(foot[:, 2].min()) - 0.2, float(foot[:, 2].max()) + rng.uniform(0.4, 2.4)
-                )
-                self._on(place, [top, *sides], number, draw(rng, "metal"), 0.2)
-        if rng.random() < 0.6 * self.solar and axes.rise < 0.1:
-            gap = rng.uniform(1.6, 2.6)
-            for v in np.arange(1.0, depth - 1.5, gap)[:25]:
-                u0, u1 = width * 0.1, width * rng.uniform(0.7, 0.92)
-                if axes.holds(u0, v, u1, v + gap * 0.6):
-                    quad = roofs.slab(axes, u0, v, u1, v + gap * 0.6, 0.1)
-                    quad[2:, 2] += 0.35
-                    self._on(place, [quad], number, self.kit.uses["solar"][0])
 
     # What stands on the ground.
 
@@ -434,9 +222,27 @@ class Site:
         self.faces += [Face(place.put(r), (), kind, 0, 0, material, shade) for r in (top, *sides)]
 
     def tank(self, place: Place, radius: float, height: float) -> None:
-        """A round tank or silo: looks like a roof, is none."""
-        angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-        self.box(place, radius * np.column_stack([np.cos(angle), np.sin(angle)]), height, "metal")
+        """A round tank or silo, flat, conical or with a sunken floating roof: looks like a roof, is none."""
+        rng = self.rng
+        if self.built(place.x, place.y):
+            return
+        angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+        ring = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        place = self.grounded(place, ring)
+        material, shade = self.kit.draw(rng, "tank"), self.tint(0.1)
+        top, sides = roofs.prism(ring, 0.0, height)
+        kind = rng.random()
+        if kind < 0.45:
+            apex = np.array([0.0, 0.0, height + radius * rng.uniform(0.08, 0.3)])
+            lids = [np.array([a, b, apex]) for a, b in zip(top, np.roll(top, -1, axis=0), strict=True)]
+        elif kind < 0.75:
+            lids = [top - np.array([0.0, 0.0, min(0.6 * height, rng.uniform(0.5, 3.0))])]
+        else:
+            lids = [top]
+        self.faces += [Face(place.put(r), (), OBJECT, 0, 0, material, shade) for r in (*lids, *sides)]
+        if kind >= 0.45 and radius > 4:  # a smaller ring on top, as floating roofs and vents have
+            inner = lids[0] * [0.35, 0.35, 1.0] + np.array([0.0, 0.0, 0.15])
+            self.faces.append(Face(place.put(inner), (), OBJECT, 0, 0, self.kit.draw(rng, "metal"), shade))
 
     def car(self, x: float, y: float, angle: float) -> None:
         """A car or van: body, cabin."""

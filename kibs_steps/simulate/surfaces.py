@@ -101,11 +101,11 @@ COUNTRIES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
         {"zinc": 2, "gravel": 2, "grey_felt": 2, "bitumen": 1},
     ),
     "holland": (
-        {"orange_tile": 4, "red_tile": 3, "dark_tile": 4, "brown_tile": 2, "grey_tile": 2},
-        {"bitumen": 4, "gravel": 2, "grey_felt": 3, "membrane": 1, "green_roof": 0.3},
+        {"orange_tile": 4, "red_tile": 3, "dark_tile": 5, "brown_tile": 3, "grey_tile": 2, "thatch": 0.4},
+        {"bitumen": 4, "gravel": 2, "grey_felt": 3, "membrane": 1, "green_roof": 0.6, "tar": 1.5},
     ),
     "germany": (
-        {"red_tile": 5, "orange_tile": 2, "brown_tile": 3, "dark_tile": 3, "slate": 1.5, "grey_tile": 1},
+        {"red_tile": 5, "orange_tile": 2, "brown_tile": 3, "dark_tile": 3, "slate": 1.5, "grey_tile": 1, "thatch": 0.3},
         {"gravel": 3, "bitumen": 2, "green_roof": 1, "grey_felt": 1},
     ),
     "mediterranean": (
@@ -113,7 +113,7 @@ COUNTRIES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
         {"terracotta": 2, "concrete": 3, "gravel": 1, "membrane": 1.5},
     ),
     "britain": (
-        {"brown_tile": 4, "slate": 4, "red_tile": 2, "grey_tile": 2, "dark_tile": 2},
+        {"brown_tile": 4, "slate": 4, "red_tile": 2, "grey_tile": 2, "dark_tile": 2, "thatch": 0.5},
         {"grey_felt": 3, "bitumen": 2, "gravel": 1},
     ),
     "scandinavia": (
@@ -196,6 +196,8 @@ def _roof(rng: np.random.Generator, name: str, age: float) -> Material:
             seam_depth=rng.uniform(0.04, 0.3),
             rim=rng.uniform(-0.2, 0.3),
         )
+    if name == "thatch":
+        return Material(colour, 0.2 * age, 0.06, streak=rng.uniform(0.1, 0.3), rim=rng.uniform(-0.4, 0.1), leaf=0.1)
     if name in FLAT:
         return Material(
             colour,
@@ -307,6 +309,30 @@ def palette(rng: np.random.Generator, country: str | None = None) -> Palette:
         list(rng.gamma(0.6, 1, 4) + 0.05),
     )
     add("gravel", [Material(_jitter(rng, c, 0.15), 0.2, 0.08) for c in ((0.42, 0.40, 0.36), (0.36, 0.31, 0.25))])
+    add(
+        "tank",
+        [
+            Material(_jitter(rng, c, 0.12), rng.uniform(0.02, 0.15), 0.02, streak=rng.uniform(0, 0.15))
+            for c in ((0.72, 0.72, 0.70), (0.5, 0.5, 0.49), (0.34, 0.17, 0.09), (0.3, 0.36, 0.33))
+        ],
+        [5, 3, 1, 1],
+    )
+    add("greenhouse", [Material((0.62, 0.66, 0.66), 0.12, 0.05, course=rng.uniform(1.6, 4.0), course_depth=0.25)])
+    add(
+        "hull",
+        [
+            Material(_jitter(rng, c, 0.2), 0.06, 0.03)
+            for c in ((0.07, 0.03, 0.025), (0.04, 0.06, 0.1), (0.3, 0.3, 0.29))
+        ],
+    )
+    add(
+        "deck",
+        [
+            Material(_jitter(rng, c, 0.2), 0.15, 0.05)
+            for c in ((0.30, 0.10, 0.06), (0.10, 0.2, 0.13), (0.3, 0.3, 0.3), (0.5, 0.42, 0.2))
+        ],
+    )
+    add("photograph", [Material((1.0, 1.0, 1.0), 0.0, 0.02)])
     add("marking", [Material((0.6, 0.6, 0.58), 0.2, 0.08)])
     add(
         "water",

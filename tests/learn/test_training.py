@@ -109,3 +109,30 @@ def test_geometry_changes_the_answer_once_learned():
         known = model(image, torch.tensor([[0.0, -2, 1, 1, 1, 1]]))
         unknown = model(image, torch.zeros(1, 6))
     assert not torch.allclose(known[2], unknown[2])
+
+
+def test_a_run_ends_when_the_validation_loss_has_stopped_falling(tmp_path, monkeypatch):
+    """Looks at every step: 3, 2, 2.5, 2.5. The best weights are those of the second, and a later call has nothing to do."""
+    told = iter([3.0, 2.0, 2.5, 2.5])
+    monkeypatch.setattr(training, "validated", lambda *arguments: next(told))
+    tiles = Tiles()
+    kept = [training.example(tiles.sample, np.random.default_rng(0), False)]
+    options = {"workers": 0, "validation": kept, "patience": 2, "look_every": 1}
+    assert training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=9, **options) == 4
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert (state["best"]["loss"], state["best"]["step"], state["best"]["since"]) == (2.0, 2, 2)
+    assert state["converged"] is True
+    name = "encoder._conv_stem.weight"
+    assert not torch.equal(state["best"]["average"][name], state["average"][name])
+    assert training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=9, **options) == 4
+
+
+def test_looking_at_validation_tiles_leaves_the_network_as_it_was():
+    model = training.network().train()
+    batch = torch.utils.data.default_collate([training.example(Tiles().sample, np.random.default_rng(0), False)] * 2)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    average = {name: value.clone() for name, value in before.items()}
+    loss = training.validated(model, average, [batch], training.dense_terms)
+    assert loss == pytest.approx(training.validated(model, average, [batch, batch], training.dense_terms), rel=1e-4)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert all(part.training for part in model.modules())

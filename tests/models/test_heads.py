@@ -126,3 +126,11 @@ def test_instance_corners_decode_class_to_bin():
     }
     found = heads.instance_corners(outputs, HEIGHTS, THRESHOLDS)
     assert sorted(zip(found.col.tolist(), found.height.round(6).tolist(), strict=True)) == [(17.5, 1.0), (47.5, 3.0)]
+
+
+def test_a_full_mask_fills_its_box_to_the_rim():
+    """Wide boxes too, whose outermost pixels lie beyond the centres of the mask's outermost cells."""
+    for box in ([10, 20, 50, 40], [3, 3, 60, 63], [5, 5, 12, 9]):
+        window, mask = heads.pasted(np.float32(box), np.ones((28, 28), np.float32), 64)
+        assert (window[1].start, window[0].start, window[1].stop, window[0].stop) == tuple(box)
+        assert (mask > 0.5).all(), box

@@ -48,3 +48,39 @@ def test_flips_leave_a_symmetric_network_alone(tmp_path):
         found.append(heads.decode_corners(runtime.open_network(model, geometry)(image), model.contract))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+class TestProviders:
+    def test_one_that_is_not_there_is_told_with_its_package(self, tmp_path):
+        """No build of onnxruntime has both: what is asked for is refused, never replaced in silence."""
+        import onnxruntime as ort
+
+        model = contract.load(toy.sections_model(tmp_path / "sections.onnx"))
+        missing = next(p for p, (name, _, _) in runtime.PROVIDERS.items() if name not in ort.get_available_providers())
+        with pytest.raises(runtime.ProviderMissing, match=runtime.PROVIDERS[missing][1]):
+            runtime.open_network(model, np.zeros((1, 6), np.float32), missing)
+
+    @pytest.mark.parametrize("provider", list(runtime.PROVIDERS))
+    def test_all_that_are_there_agree_with_the_processor(self, tmp_path, provider):
+        """Within the tolerance that docs/scaling.md states."""
+        import onnxruntime as ort
+
+        if runtime.PROVIDERS[provider][0] not in ort.get_available_providers():
+            pytest.skip(f"this onnxruntime has no provider {provider}")
+        model = contract.load(toy.sections_model(tmp_path / "sections.onnx"))
+        image = toy.paint(toy.houses(np.random.default_rng(2), toy.TILE, toy.TILE), toy.TILE, toy.TILE)
+        expected = runtime.open_network(model, np.zeros((1, 6), np.float32))(image)
+        for name, value in runtime.open_network(model, np.zeros((1, 6), np.float32), provider, 2)(image).items():
+            np.testing.assert_allclose(value, expected[name], atol=1e-3)
+
+
+class TestRecord:
+    def test_a_model_that_changed_is_refused(self, tmp_path):
+        path = toy.sections_model(tmp_path / "sections.onnx")
+        contract.main([str(path), "--task", "sections", "--out", str(tmp_path / "sections.json")])
+        assert runtime.from_record(tmp_path / "sections.json", "sections") == contract.load(path)
+        with pytest.raises(contract.ContractMismatch, match="used here for corners"):
+            runtime.from_record(tmp_path / "sections.json", "corners")
+        path.write_bytes(path.read_bytes() + b"\0")
+        with pytest.raises(contract.ContractMismatch, match="changed"):
+            runtime.from_record(tmp_path / "sections.json", "sections")

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 import toy_city
 
-from kibs_steps import gate, solids, store
+from kibs_steps import features, gate, solids, store
 from kibs_steps.publish import cityjson
 
 
@@ -162,7 +162,7 @@ def test_reference_systems():
 
 def test_an_empty_city(tmp_path):
     scene = toy_city.make_scene(tmp_path)
-    (tmp_path / "none.city.jsonl").write_text(json.dumps(solids.header((0, 0))) + "\n")
+    (tmp_path / "none.city.jsonl").write_text(json.dumps(features.header((0, 0))) + "\n")
     out, lines = tmp_path / "city.city.json", tmp_path / "city.city.jsonl"
     arguments = ["--scene", str(scene.folder / "scene.json"), "--solids", str(tmp_path / "none.city.jsonl")]
     cityjson.main([*arguments, "--out", str(out), "--seq", str(lines)])

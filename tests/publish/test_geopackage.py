@@ -1,9 +1,11 @@
 """City as a GeoPackage: every layer as DESIGN fixes it, read back by GDAL; the same bytes at another time."""
 
 import sqlite3
+import subprocess
 import time
 import xml.etree.ElementTree as ET
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -49,6 +51,9 @@ def solids_table():
                 "volume": None if lod == "0" else 1234.5,
                 "footprint_area": shape.area,
                 "roof_type": "gable",
+                "height_sigma": 0.5,
+                "position_sigma": 0.3,
+                "faithful": 1.0,
                 "outline": shapely.to_wkb(shapely.MultiPolygon([shape])),
                 "footprint": None if lod == "0" else shapely.to_wkb(shape),
             }
@@ -181,11 +186,22 @@ def test_graduated_style_has_no_gap():
 def test_a_city_without_buildings(tmp_path):
     """Layers are there, with all their columns, when nothing was found."""
     scene = toy.make_scene(tmp_path)
-    content = geopackage.layers(
-        toy.buildings_table(scene).slice(0, 0), solids_table().slice(0, 0), corners_table(scene).slice(0, 0)
-    )
+    tables = toy.buildings_table(scene), solids_table(), corners_table(scene)
+    content = geopackage.layers(*(lambda t=t: iter([t.slice(0, 0)]) for t in tables))
     geopackage.write(tmp_path / "empty.gpkg", content, toy.CRS, {})
     for name, kind in dict(pyogrio.list_layers(tmp_path / "empty.gpkg")).items():
         if name != "layer_styles":
             assert kind == LAYERS[name]
             assert pyogrio.read_info(tmp_path / "empty.gpkg", layer=name)["features"] == 0
+
+
+def test_gdals_validator_is_content(city):
+    """GDAL's `validate_gpkg` (package python3-gdal of Debian); skipped where the system's Python has none."""
+    python = "/usr/bin/python3"
+    module = "osgeo_utils.samples.validate_gpkg"
+    if not Path(python).exists() or subprocess.run([python, "-c", f"import {module}"], capture_output=True).returncode:
+        pytest.skip("GDAL's validate_gpkg is not installed (Debian: python3-gdal)")
+    _, write = city
+    done = subprocess.run([python, "-m", module, str(write())], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "error" not in done.stdout.lower() + done.stderr.lower()

@@ -32,8 +32,20 @@ def test_everything_is_recorded(tmp_path, capsys):
     rows[1] |= {"status": "two_corners", "status_reason": "2 corners: level at 7.5 m"}
     store.write_table(tmp_path / "buildings.parquet", pa.Table.from_pylist(rows))
     solids = [
-        {"lod": lod, "lod_reason": reason, "valid": lod != "0", "position_corrected": True, "roof_type": "gable"}
-        for lod, reason in (("2.0", ""), ("2.0", ""), ("1.2", "roof self-intersects at 12.5, 3.1"))
+        {
+            "building_id": building,
+            "lod": lod,
+            "lod_reason": reason,
+            "valid": lod != "0",
+            "position_corrected": True,
+            "roof_type": "gable",
+            "faithful": share,
+        }
+        for building, lod, reason, share in (
+            (11, "2.0", "", 1.0),
+            (13, "2.0", "", 0.5),
+            (14, "1.2", "roof self-intersects at 12.5, 3.1", 0.0),
+        )
     ]
     store.write_table(tmp_path / "solids.parquet", pa.Table.from_pylist(solids))
     store.write_json(tmp_path / "corners.json", MODEL)
@@ -70,6 +82,7 @@ def test_everything_is_recorded(tmp_path, capsys):
     assert sections["reasons"] == {"# corners: level at # m": 2}
     assert buildings["lod"] == {"2.0": 2, "1.2": 1}
     assert buildings["valid"] == 3
+    assert buildings["lod2"] == {"with_ok_section": 2, "lod2": 0, "share": 0.0, "without_solid": 0}
     assert list(buildings["reasons"].values()) == [1]
     assert found["times"]["planes"] == {"jobs": 2, "seconds": 2.5, "longest": 2.0, "peak_mb": 90.0}
     assert found["times"]["scene"]["jobs"] == 1

@@ -9,8 +9,8 @@ from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
 from kibs_steps.simulate import scene
 from kibs_steps.simulate.camera import Camera
+from kibs_steps.simulate.pieces import CLUTTER, OBJECT, ROOF, WALL, City, Face, Paint
 from kibs_steps.simulate.roofs import prism
-from kibs_steps.simulate.site import OBJECT, ROOF, WALL, City, Face, Paint
 from kibs_steps.simulate.surfaces import Material
 
 GRID = Grid("", 0.0, 60.0, 0.3, 200, 200)
@@ -85,7 +85,7 @@ def test_tall_building_hides_the_low_one_behind():
 def test_things_on_a_roof_belong_to_its_section():
     faces = block(20, 20, 32, 32, 6.0, 1)
     top, sides = prism(np.array([[25.0, 25], [26, 25], [26, 26], [25, 26]]), 6.0, 7.5)
-    faces += [Face(r, (), scene.CLUTTER, 0, 1, 0) for r in (top, *sides)]
+    faces += [Face(r, (), CLUTTER, 0, 1, 0) for r in (top, *sides)]
     picture = shoot(faces)
     assert picture.sections[0].visible == pytest.approx(1.0, abs=0.02)
     assert np.allclose(picture.height[picture.section == 1], 6.0, atol=1e-4)

@@ -23,10 +23,17 @@ PUBLISHED = [
     "city.gpkg",
     "city.city.json",
     "city.city.jsonl",
+    "city.glb",
+    "city.obj",
+    "city.mtl",
+    "tiles3d/tileset.json",
     "points.txt",
+    "ksr/points.ply",
     "heights.tif",
     "labels.tif",
+    "dsm.tif",
     "preview.png",
+    "viewer.html",
     "run.json",
 ]
 SAME_BYTES = [f for f in PUBLISHED if f != "run.json"]

@@ -9,6 +9,7 @@ from pathlib import Path
 from snakemake.io import IOFile
 
 from kibs_steps import cli, failures, inputs as user_inputs, plan as plans, settings
+from kibs_steps import sources
 
 RESULTS = Path("results")
 RUN = f"{workflow.basedir}/envs/run.yaml"
@@ -39,10 +40,17 @@ PUBLISHED = [
     "city.gpkg",
     "city.city.json",
     "city.city.jsonl",
+    "city.glb",
+    "city.obj",
+    "city.mtl",
+    "tiles3d/tileset.json",
     "points.txt",
+    "ksr/points.ply",
     "heights.tif",
     "labels.tif",
+    "dsm.tif",
     "preview.png",
+    "viewer.html",
     "run.json",
 ]
 
@@ -118,17 +126,47 @@ def blocks(path):
     ]
 
 
+def blocks_read(wildcards):
+    """The raster that blocks read: the scene's own, or its tiled copy."""
+    return plan(wildcards).blocks_read(f"results/{wildcards.scene}/tiled.tif")
+
+
 def source(wildcards):
     """The folder of a block's detections: by the models, or fed from the truth."""
     return "fed" if plan(wildcards).settings["feed"] == "truth" else "detected"
 
 
+def measured(p):
+    """Whether heights come from a surface model, so that the 3D model has nothing to do."""
+    two = p.settings["feed"] == "models" and p.settings["method"] == "two_stage"
+    return two and bool(p.settings.get("dsm"))
+
+
+def found_corners(wildcards):
+    """The corners of every block; none where heights come from a surface model."""
+    if measured(plan(wildcards)):
+        return []
+    return blocks(f"{source(wildcards)}/corners.parquet")(wildcards)
+
+
 def detections(wildcards):
-    """What `stitch` joins: four files of every block."""
-    files = ("pieces.parquet", "links.parquet", "seams.npz", "corners.parquet")
+    """What `stitch` joins: four files of every block, or three without corners."""
+    files = ("pieces.parquet", "links.parquet", "seams.npz")
     return [
-        f for name in files for f in blocks(f"{source(wildcards)}/{name}")(wildcards)
+        *(
+            f
+            for name in files
+            for f in blocks(f"{source(wildcards)}/{name}")(wildcards)
+        ),
+        *found_corners(wildcards),
     ]
+
+
+def sectioned(name):
+    """`sections.parquet` or `corners.parquet` of the scene: as stitched, or as edited by hand."""
+    return lambda w: (
+        f"results/{w.scene}/{'edited' if plan(w).settings.get('sections') else 'stitched'}/{name}"
+    )
 
 
 def licensed(wildcards):
@@ -163,7 +201,7 @@ def kept(p):
             "tiles.tif",
             "sections.tif",
             "detected/pieces.parquet",
-            "detected/corners.parquet",
+            *([] if measured(p) else ["detected/corners.parquet"]),
         ]
     )
     files = [

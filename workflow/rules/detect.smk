@@ -28,13 +28,17 @@ rule sections:
     retries: 1
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("sections"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.sections --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} > {log:q} 2>&1"
 
@@ -83,12 +87,16 @@ rule corners:
     retries: 1
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("corners"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
     shell:
         "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs(
@@ -120,13 +128,17 @@ rule single:
     retries: 1
     conda:
         RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("single"),
         tiling=lambda w: plan(w).tiling,
+        options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.single --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} --corners {output.corners:q} > {log:q} 2>&1"
 
@@ -219,8 +231,9 @@ rule stitch:
             f"results/{w.scene}/blocks/{b.name}/{source(w)}"
             for b in plan(w).having("feed")
         ],
+        corners=lambda w: ["--without-corners"] if measured(plan(w)) else [],
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"
-        " --reach {params.reach} --seam-rule {params.seams}"
+        " --reach {params.reach} --seam-rule {params.seams} {params.corners}"
         " --folders {params.folders:q} --sections {output.sections:q} --corners {output.corners:q} > {log:q} 2>&1"

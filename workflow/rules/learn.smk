@@ -1,52 +1,90 @@
-# Training; needs the extra `learn` (torch). Checkpoints stay in runs/, so the same command goes on after a kill.
+# Training; needs the extra `learn` (torch). Checkpoints lie in runs/ and are no rule's output, which Snakemake would delete:
+# the same command goes on after a kill.
 
-TRAIN = {
-    "name": "mine",
-    "data": None,
-    "minutes": 90,
-    "seed": 0,
-    "tiles": 4000,
-    **(config.get("train") or {}),
-}
+from kibs_steps.learn import recipe as recipes
+
+try:
+    RECIPE = recipes.recipe(config, Path(workflow.basedir))
+    TRAIN = {**recipes.DEFAULTS, **(config.get("train") or {})}
+except KibsError as error:
+    raise WorkflowError(str(error)) from None
 
 
-rule trained:
-    """Train the network within its time budget."""
+rule own_samples:
+    """Training, validation and testing tiles of a raster with its annotation."""
+    input:
+        lambda w: RECIPE.files(w.own),
     output:
-        "runs/{name}/checkpoint.pt",
+        "runs/{name}/own/{own}/own.json",
     log:
-        "runs/{name}/training.log",
+        "runs/{name}/logs/own_{own}.log",
     conda:
         LEARN
     params:
-        data=TRAIN["data"],
-        minutes=TRAIN["minutes"],
-        options=[f"--seed={TRAIN['seed']}", f"--tiles={TRAIN['tiles']}"],
+        options=lambda w: recipes.own_options(
+            RECIPE.own[w.own], TRAIN["split"], TRAIN["seed"]
+        ),
     shell:
-        "python -m kibs_steps.learn.training --data {params.data:q} --minutes {params.minutes} {params.options:q}"
-        " --pool runs/{wildcards.name:q}/pool --out runs/{wildcards.name:q} > {log:q} 2>&1"
+        "python -m kibs_steps.learn.own {params.options:q} --out $(dirname {output:q}) > {log:q} 2>&1"
+
+
+rule trained:
+    """Train one network within its time budget."""
+    input:
+        own=[f"runs/{RECIPE.name}/own/{own}/own.json" for own in RECIPE.own],
+    output:
+        "runs/{name}/{network}/done.json",
+    log:
+        "runs/{name}/logs/training_{network}.log",
+    conda:
+        LEARN
+    threads: workflow.cores
+    params:
+        options=lambda w: RECIPE.training[w.network],
+        own=lambda w: [f"runs/{w.name}/own/{own}" for own in RECIPE.own],
+    shell:
+        "python -m kibs_steps.learn.training {params.options:q} --own {params.own:q} --threads {threads}"
+        " --pool runs/{wildcards.name:q}/pool --out $(dirname {output:q}) > {log:q} 2>&1"
 
 
 rule exported:
-    """Export the trained network as the ONNX model of one task, with its contract."""
+    """Export a trained network as the ONNX model of one task, with its contract."""
     input:
-        "runs/{name}/checkpoint.pt",
+        lambda w: f"runs/{w.name}/{RECIPE.network_of[w.task]}/done.json",
     output:
         "models/{name}/{task}.onnx",
     log:
-        "runs/{name}/export_{task}.log",
+        "runs/{name}/logs/export_{task}.log",
+    wildcard_constraints:
+        task="both|sections|corners",
     conda:
         LEARN
     shell:
-        "python -m kibs_steps.learn.export --checkpoint {input:q} --task {wildcards.task}"
+        "python -m kibs_steps.learn.export --checkpoint $(dirname {input:q})/checkpoint.pt --task {wildcards.task}"
         " --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
 
 
-rule train:
-    """Train a model set (config key `train`: name, data, minutes, seed, tiles)."""
+rule card:
+    """The model card and the curves of a trained set."""
     input:
-        expand(
-            "models/{name}/{task}.onnx",
-            name=TRAIN["name"],
-            task=["sections", "corners"],
-        ),
+        models=lambda w: [f"models/{w.name}/{task}.onnx" for task in RECIPE.network_of],
+        done=lambda w: [
+            f"runs/{w.name}/{network}/done.json" for network in RECIPE.training
+        ],
+    output:
+        card="models/{name}/README.md",
+        curves="models/{name}/curves.png",
+    log:
+        "runs/{name}/logs/card.log",
+    conda:
+        LEARN
+    shell:
+        "python -m kibs_steps.learn.card --models {input.models:q} --runs {input.done:q} --card {output.card:q}"
+        " --curves {output.curves:q} > {log:q} 2>&1"
+
+
+rule train:
+    """Train a model set as the config key `train` says (docs/models.md)."""
+    input:
+        [f"models/{RECIPE.name}/{task}.onnx" for task in RECIPE.network_of],
+        f"models/{RECIPE.name}/README.md",

@@ -104,7 +104,7 @@ rule preview:
     """preview.png: the raster with the roof sections found."""
     input:
         scene=given("results/{scene}/scene.json"),
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(plan(w).raster)),
         sections=given("results/{scene}/buildings.parquet"),
     output:
         "results/{scene}/preview.png",
@@ -117,6 +117,144 @@ rule preview:
     shell:
         "python -m kibs_steps.publish.preview --scene {input.scene:q} --sections {input.sections:q}"
         " --out {output:q} > {log:q} 2>&1"
+
+
+given = inputs("glb", "results/{scene}/city.glb")
+
+
+rule glb:
+    """city.glb: the city for 3D viewers."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        raster=given(lambda w: sources.files(plan(w).raster)),
+        dtm=given("results/{scene}/dtm.tif"),
+        solids=given(blocks("solids.city.jsonl")),
+        models=given(licensed),
+    output:
+        "results/{scene}/city.glb",
+    log:
+        "results/{scene}/logs/glb.log",
+    conda:
+        RUN
+    params:
+        signature=signature("glb"),
+        drape=lambda w: ["--drape"] if plan(w).settings["drape"] else [],
+    shell:
+        "python -m kibs_steps.publish.glb --scene {input.scene:q} --solids {input.solids:q}"
+        " --models {input.models:q} {params.drape} --out {output:q} > {log:q} 2>&1"
+
+
+given = inputs("solids", "results/{scene}/city.obj", "results/{scene}/city.mtl")
+
+
+rule obj:
+    """city.obj and its colours, city.mtl."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        solids=given(blocks("solids.city.jsonl")),
+    output:
+        city="results/{scene}/city.obj",
+        materials="results/{scene}/city.mtl",
+    log:
+        "results/{scene}/logs/obj.log",
+    conda:
+        RUN
+    params:
+        signature=signature("solids"),
+    shell:
+        "python -m kibs_steps.publish.obj --scene {input.scene:q} --solids {input.solids:q}"
+        " --out {output.city:q} --materials {output.materials:q} > {log:q} 2>&1"
+
+
+given = inputs("solids", "results/{scene}/tiles3d/tileset.json")
+
+
+rule tiles3d:
+    """tiles3d/: the city on the globe."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        solids=given(blocks("solids.city.jsonl")),
+        models=given(licensed),
+    output:
+        "results/{scene}/tiles3d/tileset.json",
+    log:
+        "results/{scene}/logs/tiles3d.log",
+    conda:
+        RUN
+    params:
+        signature=signature("solids"),
+    shell:
+        "python -m kibs_steps.publish.tiles3d --scene {input.scene:q} --solids {input.solids:q}"
+        " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
+
+
+given = inputs("solids", "results/{scene}/dsm.tif")
+
+
+rule dsm:
+    """dsm.tif: terrain and buildings."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        dtm=given("results/{scene}/dtm.tif"),
+        solids=given(blocks("solids.city.jsonl")),
+        models=given(licensed),
+    output:
+        "results/{scene}/dsm.tif",
+    log:
+        "results/{scene}/logs/dsm.log",
+    conda:
+        RUN
+    params:
+        signature=signature("solids"),
+    shell:
+        "python -m kibs_steps.publish.dsm --scene {input.scene:q} --solids {input.solids:q}"
+        " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
+
+
+given = inputs("solids", "results/{scene}/ksr/points.ply")
+
+
+rule ksr:
+    """ksr/points.ply: oriented points of roofs, walls and ground."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        dtm=given("results/{scene}/dtm.tif"),
+        solids=given(blocks("solids.city.jsonl")),
+    output:
+        "results/{scene}/ksr/points.ply",
+    log:
+        "results/{scene}/logs/ksr.log",
+    conda:
+        RUN
+    params:
+        signature=signature("solids"),
+    shell:
+        "python -m kibs_steps.publish.ksr --scene {input.scene:q} --solids {input.solids:q}"
+        " --out {output:q} > {log:q} 2>&1"
+
+
+given = inputs("solids", "results/{scene}/viewer.html")
+
+
+rule viewer:
+    """viewer.html: the city in a browser."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        raster=given(lambda w: sources.files(plan(w).raster)),
+        dtm=given("results/{scene}/dtm.tif"),
+        solids=given(blocks("solids.city.jsonl")),
+        models=given(licensed),
+    output:
+        "results/{scene}/viewer.html",
+    log:
+        "results/{scene}/logs/viewer.log",
+    conda:
+        RUN
+    params:
+        signature=signature("solids"),
+    shell:
+        "python -m kibs_steps.publish.viewer --scene {input.scene:q} --solids {input.solids:q}"
+        " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs("buildings", "results/{scene}/paper.tif")
@@ -150,7 +288,9 @@ rule record:
     """run.json: versions, hashes, models and their licences, counts."""
     input:
         scene=given("results/{scene}/scene.json"),
-        sources=given(lambda w: [plan(w).raster, *plan(w).terrain_files]),
+        sources=given(
+            lambda w: [*sources.files(plan(w).raster), *plan(w).terrain_files]
+        ),
         models=given(licensed),
         sections=given("results/{scene}/buildings.parquet"),
         solids=given(blocks("solids.parquet")),
@@ -163,8 +303,9 @@ rule record:
     params:
         signature=signature("run"),
         settings=lambda w: json.dumps(plan(w).settings),
+        remote=lambda w: plan(w).remote,
         blocks=failed,
     shell:
-        "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} --models {input.models:q}"
+        "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} {params.remote:q} --models {input.models:q}"
         " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"
         " {params.blocks:q} --out {output:q} > {log:q} 2>&1"

@@ -2,6 +2,59 @@
 
 
 given = inputs(
+    "edited",
+    "results/{scene}/edited/sections.parquet",
+    "results/{scene}/edited/corners.parquet",
+)
+
+
+rule edited:
+    """Take roof sections corrected by hand instead of those that were stitched."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        layer=given(lambda w: plan(w).settings["sections"]),
+        stitched=given("results/{scene}/stitched/sections.parquet"),
+        found=given(found_corners),
+    output:
+        sections="results/{scene}/edited/sections.parquet",
+        corners="results/{scene}/edited/corners.parquet",
+    log:
+        "results/{scene}/logs/edited.log",
+    conda:
+        RUN
+    params:
+        signature=signature("edited"),
+        tiling=lambda w: plan(w).tiling,
+        reach=lambda w: plan(w).reach,
+    shell:
+        "python -m kibs_steps.edited --scene {input.scene:q} --layer {input.layer:q} --stitched {input.stitched:q}"
+        " --found {input.found:q} --tile {params.tiling.tile} --margin {params.tiling.margin}"
+        " --block {params.tiling.block} --reach {params.reach} --sections {output.sections:q}"
+        " --corners {output.corners:q} > {log:q} 2>&1"
+
+
+given = inputs("surface", "results/{scene}/surface.tif")
+
+
+rule surface:
+    """Bring the user's surface model into the scene's CRS."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        raster=given(lambda w: sources.files(plan(w).raster)),
+        dsm=given(lambda w: plan(w).settings["dsm"]),
+    output:
+        "results/{scene}/surface.tif",
+    log:
+        "results/{scene}/logs/surface.log",
+    conda:
+        RUN
+    params:
+        signature=signature("surface"),
+    shell:
+        "python -m kibs_steps.surface --scene {input.scene:q} --dsm {input.dsm:q} --out {output:q} > {log:q} 2>&1"
+
+
+given = inputs(
     "planes",
     "results/{scene}/blocks/{block}/planes.parquet",
     "results/{scene}/blocks/{block}/filed_corners.parquet",
@@ -13,8 +66,15 @@ rule planes:
     input:
         scene=given("results/{scene}/scene.json"),
         dtm=given("results/{scene}/dtm.tif"),
-        sections=given("results/{scene}/stitched/sections.parquet"),
-        corners=given("results/{scene}/stitched/corners.parquet"),
+        sections=given(sectioned("sections.parquet")),
+        corners=given(sectioned("corners.parquet")),
+        surface=given(
+            lambda w: (
+                [f"results/{w.scene}/surface.tif"]
+                if plan(w).settings.get("dsm")
+                else []
+            )
+        ),
         model=given("results/{scene}/models/corners.json"),
     output:
         planes="results/{scene}/blocks/{block}/planes.parquet",
@@ -28,9 +88,11 @@ rule planes:
         signature=signature("planes"),
         reach=lambda w: plan(w).reach,
         rule=lambda w: plan(w).settings["planes"],
+        surface=lambda w, input: [f"--surface={f}" for f in input.surface],
     shell:
         "python -m kibs_steps.planes --scene {input.scene:q} --sections {input.sections:q} --corners {input.corners:q}"
         " --model {input.model:q} --name {wildcards.block} --reach {params.reach} --rule {params.rule}"
+        " {params.surface:q}"
         " --planes {output.planes:q} --filed {output.filed:q} > {log:q} 2>&1"
 
 

@@ -31,7 +31,7 @@ given = inputs("scene", "results/{scene}/scene.json", "results/{scene}/dtm.tif")
 rule scene:
     """Check the raster and the terrain once, and write what every later step needs to know."""
     input:
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(plan(w).raster)),
         dtm=given(lambda w: plan(w).terrain_files),
     output:
         scene="results/{scene}/scene.json",
@@ -43,6 +43,7 @@ rule scene:
     params:
         signature=signature("scene"),
         gsd=lambda w: plan(w).models["sections"].contract["gsd"],
+        raster=lambda w: plan(w).raster,
         dtm=lambda w: plan(w).dtm,
         options=options(
             "view_azimuth",
@@ -53,10 +54,28 @@ rule scene:
             "bands",
             "aoi",
             "vertical_crs",
+            "regions",
         ),
     shell:
-        "python -m kibs_steps.scene --name {wildcards.scene:q} --raster {input.raster:q} --dtm={params.dtm:q}"
+        "python -m kibs_steps.scene --name {wildcards.scene:q} --raster {params.raster:q} --dtm={params.dtm:q}"
         " --gsd {params.gsd} {params.options:q} --out {output.scene:q} > {log:q} 2>&1"
+
+
+rule tiled:
+    """A tiled copy of a raster whose own layout would make every block decode most of it."""
+    input:
+        lambda w: sources.files(plan(w).raster),
+    output:
+        temp("results/{scene}/tiled.tif"),
+    log:
+        "results/{scene}/logs/tiled.log",
+    conda:
+        RUN
+    params:
+        signature=signature("source"),
+        raster=lambda w: plan(w).raster,
+    shell:
+        "python -m kibs_steps.tiled --raster {params.raster:q} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs("tiles", "results/{scene}/blocks/{block}/tiles.tif")
@@ -66,7 +85,7 @@ rule tiles:
     """The image of one block on the models' grid, margins included."""
     input:
         scene=given("results/{scene}/scene.json"),
-        raster=given(lambda w: plan(w).raster),
+        raster=given(lambda w: sources.files(blocks_read(w))),
     output:
         "results/{scene}/blocks/{block}/tiles.tif",
     log:
@@ -77,9 +96,10 @@ rule tiles:
     params:
         signature=signature("tiles"),
         tiling=lambda w: plan(w).tiling,
+        raster=blocks_read,
     shell:
-        "python -m kibs_steps.tiles --scene {input.scene:q} --name {wildcards.block} --tile {params.tiling.tile}"
-        " --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
+        "python -m kibs_steps.tiles --scene {input.scene:q} --raster {params.raster:q} --name {wildcards.block}"
+        " --tile {params.tiling.tile} --margin {params.tiling.margin} --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs("model_{task}", "results/{scene}/models/{task}.json")
@@ -93,6 +113,7 @@ rule model:
         "results/{scene}/models/{task}.json",
     log:
         "results/{scene}/logs/model_{task}.log",
+    localrule: True
     conda:
         RUN
     params:

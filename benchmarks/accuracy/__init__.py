@@ -1,0 +1,1 @@
+"""Accuracy of model sets on fixed test sets that none of them was trained on (docs/benchmarks.md)."""

@@ -1,0 +1,167 @@
+"""Edited: roof sections corrected by hand, in the place of those that were found.
+
+In: a polygon layer like `roof_sections_image` of `city.gpkg` (outlines where they are *seen*, column `section_id`), as edited
+in QGIS; what was
+stitched; all corners. Out: sections and corners by block, as `stitch` writes them, for `planes`. A section that was not
+touched keeps its
+outline to the bit, its id and all that is known of it. One that was changed keeps its id; of several with one id (split in two)
+the one that holds the id's pixel, else the first. New ones get an id from their place. Heights come from the corners, not from
+the layer's z.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from kibs_steps import cli, scene, store
+from kibs_steps.corners import CORNERS
+from kibs_steps.errors import KibsError
+from kibs_steps.grid import Grid, Tiling
+from kibs_steps.stitch import SECTIONS, distinct_corners, owner_blocks, section_ids, touches_edge
+
+LAYER = "roof_sections_image"
+SAME = 1e-4  # px: an outline that moved less was not touched
+
+
+class SectionsUnusable(KibsError):
+    """A layer of edited sections that cannot be read as polygons."""
+
+
+def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Ids (n,), 0 where there is none, and outlines (n,) in image coordinates (px). Raises `SectionsUnusable`."""
+    import geopandas
+    import pyogrio
+
+    try:
+        layers = [str(name) for name, _ in pyogrio.list_layers(path)]
+        frame = geopandas.read_file(path, layer=LAYER if LAYER in layers else layers[0])
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, IndexError) as error:
+        raise SectionsUnusable(
+            f"sections {path} cannot be read ({error}): give the edited city.gpkg or a GeoPackage"
+        ) from error
+    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].explode(ignore_index=True)
+    if frame.empty:
+        raise SectionsUnusable(f"sections {path} holds no polygons: give the layer {LAYER} as edited")
+    if frame.crs is None:
+        raise SectionsUnusable(f"sections {path} says no CRS: assign {grid.crs.splitlines()[0]}")
+    frame = frame.to_crs(grid.crs)
+    ids = (
+        frame["section_id"].fillna(0).astype(np.int64).to_numpy()
+        if "section_id" in frame
+        else np.zeros(len(frame), np.int64)
+    )
+    outlines = shapely.transform(shapely.force_2d(frame.geometry.to_numpy()), grid.to_image)
+    outlines = np.array([_polygon(g) for g in outlines], object)
+    usable = np.array([g is not None for g in outlines])
+    return ids[usable], outlines[usable]
+
+
+def _polygon(outline: shapely.Geometry) -> shapely.Geometry | None:
+    """A valid polygon of an outline drawn by hand: the largest part where it crosses itself."""
+    if outline.is_valid:
+        return outline if outline.area > 0 else None
+    parts = [p for p in shapely.get_parts(shapely.make_valid(outline)) if p.geom_type == "Polygon"]
+    return max(parts, key=shapely.area, default=None)
+
+
+def named(ids: np.ndarray, outlines: np.ndarray, known: set[int], grid: Grid) -> np.ndarray:
+    """Ids (n,), each once: the given one where it is known, else one from the outline's place."""
+    given = ids.copy()
+    pixel = np.stack([(ids - 1) % grid.width + 0.5, (ids - 1) // grid.width + 0.5], axis=1)
+    holds = np.array([shapely.contains_xy(o, *p) for o, p in zip(outlines, pixel, strict=True)], bool)
+    order = np.lexsort((np.arange(len(ids)), ~holds))  # those that hold their id's pixel choose first
+    taken: set[int] = set()
+    for k in order:
+        if given[k] in known and given[k] not in taken:
+            taken.add(int(given[k]))
+        else:
+            given[k] = 0
+    fresh = section_ids(outlines, grid)
+    for k in np.flatnonzero(given == 0):
+        name = int(fresh[k])
+        while name in taken or name in known:
+            name = name % (grid.width * grid.height) + 1
+        given[k] = name
+        taken.add(name)
+    return given
+
+
+def edited(
+    ids: np.ndarray, outlines: np.ndarray, before: pa.Table, corners: pa.Table, grid: Grid
+) -> tuple[pa.Table, pa.Table]:
+    """Sections after `stitch.SECTIONS`, by id, and the corners; `before` is what was stitched.
+
+    Corners that belonged to a section that was touched are free again.
+    """
+    row_of = {section: k for k, section in enumerate(before["section_id"].to_pylist())}
+    old = shapely.from_wkb(before["outline"].to_numpy(zero_copy_only=False))
+    ids = named(ids, outlines, set(row_of), grid)
+    order = np.argsort(ids)
+    ids, outlines = ids[order], shapely.orient_polygons(outlines[order])
+    rows = [row_of.get(int(k)) for k in ids]
+    touched = np.array(
+        [
+            r is None or not shapely.equals_exact(old[r].normalize(), o.normalize(), SAME)
+            for r, o in zip(rows, outlines, strict=True)
+        ],
+        bool,
+    )
+    edge = touches_edge(outlines, grid)
+    column = {name: before[name].to_pylist() for name in SECTIONS.names}
+    values: dict[str, list] = {name: [] for name in SECTIONS.names}
+    for k, row in enumerate(rows):
+        found = {"section_id": int(ids[k]), "outline": shapely.to_wkb(outlines[k]), "score": 1.0, "split": 2}
+        found |= {"edge": bool(edge[k]), "void": False, "owner": 0}
+        if row is not None:
+            found |= {name: column[name][row] for name in ("score", "split", "void")}
+        if not touched[k]:
+            found = {name: column[name][row] for name in SECTIONS.names}
+        for name, value in found.items():
+            values[name].append(value)
+    table = pa.table([pa.array(values[f.name], f.type) for f in SECTIONS], schema=SECTIONS)
+    owner = corners["owner"].to_numpy()
+    kept = np.where(np.isin(owner, table["owner"].to_numpy()), owner, 0)
+    return table, corners.set_column(corners.column_names.index("owner"), "owner", pa.array(kept, pa.int64()))
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Take sections corrected by hand instead of those that were stitched."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.edited", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--layer", required=True, help="the edited layer: roof_sections_image of a GeoPackage")
+    parser.add_argument("--stitched", required=True, help="stitched/sections.parquet")
+    parser.add_argument("--found", nargs="*", default=[], help="corners.parquet of every block")
+    parser.add_argument("--tile", type=int, required=True, help="tile side, px")
+    parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
+    parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
+    parser.add_argument("--sections", required=True, help="out: sections of all blocks")
+    parser.add_argument("--corners", required=True, help="out: corners of all blocks")
+    args = parser.parse_args(argv)
+    facts = scene.read(args.scene)
+    tiling = Tiling(args.tile, args.margin, args.block)
+    before = store.read_table(args.stitched)
+    corners = distinct_corners(pa.concat_tables([CORNERS.empty_table(), *(store.read_table(f) for f in args.found)]))
+    sections, corners = edited(*read(args.layer, facts.grid), before, corners, facts.grid)
+    outlines = shapely.from_wkb(sections["outline"].to_numpy(zero_copy_only=False))
+    block_of = owner_blocks(sections["section_id"].to_numpy(), facts.grid, tiling)
+    tree = shapely.STRtree(shapely.points(np.stack([corners["col"].to_numpy(), corners["row"].to_numpy()], axis=1)))
+    by_block, near = {}, {}
+    for block in tiling.blocks(facts.grid.width, facts.grid.height):
+        mine = np.flatnonzero((block_of == (block.row, block.col)).all(axis=1))
+        by_block[block.name] = sections.take(pa.array(mine))
+        reached = (
+            np.unique(tree.query(outlines[mine], predicate="dwithin", distance=args.reach)[1]) if len(mine) else mine
+        )
+        near[block.name] = corners.take(pa.array(reached))
+    store.write_by_block(args.sections, by_block)
+    store.write_by_block(args.corners, near)
+
+
+if __name__ == "__main__":
+    cli.run(main)

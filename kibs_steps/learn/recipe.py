@@ -1,0 +1,122 @@
+"""Recipe: what `snakemake train` does, from the config key `train` to the options of its programs; needs no torch.
+
+`own` names scenes of the same configuration that have a raster, terrain and truth, or gives such data itself (keys as of a
+scene, and `buildings`, `annotated`); `scene` names the scene a model is fine-tuned for: tiles are simulated at its angles.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from kibs_steps.plan import BadConfig
+
+DEFAULTS = {
+    "name": "mine",
+    "family": "dense",
+    "data": None,
+    "own": [],
+    "split": "blocks",
+    "scene": None,
+    "init": None,
+    "minutes": 90,
+    "steps": None,
+    "seed": 0,
+    "tiles": 4000,
+    "cities": [],
+    "leave_out": [],
+    "validation": 0,
+    "patience": 10,
+    "shares": None,
+    "device": "cpu",
+}
+ANGLES = tuple(f"{name}_{angle}" for name in ("view", "sun") for angle in ("azimuth", "elevation"))
+OWN = ("raster", "dtm", "truth", "buildings", "annotated", "truth_frame", "truth_z", *ANGLES)
+OWN += ("projection_height", "bands", "aoi")
+EXPORTS = {  # network that is trained -> models made of it
+    "dense": {"both": ("both", "sections", "corners")},
+    "maskrcnn": {"sections": ("sections",), "corners": ("corners",)},
+}
+
+
+class Recipe(NamedTuple):
+    """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.training` by network."""
+
+    name: str
+    network_of: dict[str, str]
+    own: dict[str, dict[str, Any]]
+    training: dict[str, list[str]]
+
+    def files(self, own: str) -> list[str]:
+        """The files of one own data set that are there."""
+        given = self.own[own]
+        named = [given.get(key) for key in ("raster", "dtm", "truth", "buildings", "annotated", "aoi")]
+        return [str(f) for f in named if f is not None and Path(str(f)).is_file()]
+
+
+def recipe(config: dict[str, Any], base: Path) -> Recipe:
+    """The recipe of a checked configuration; `base` is the workflow's folder. Raises `BadConfig`."""
+    train = {**DEFAULTS, **(config.get("train") or {})}
+    common = {k: v for k, v in config.items() if k in OWN}
+    scenes = config.get("scenes") or {}
+
+    def settings_of(name: str, wanted_by: str) -> dict[str, Any]:
+        if name not in scenes and name != config.get("scene"):
+            raise BadConfig(f"train.{wanted_by}: there is no scene {name!r} in the configuration")
+        return {**common, **(scenes.get(name) or {})}
+
+    own: dict[str, dict[str, Any]] = {}
+    for i, item in enumerate(train["own"]):
+        given = settings_of(item, "own") if isinstance(item, str) else {**common, **item}
+        name = item if isinstance(item, str) else str(item.get("name", f"own{i}"))
+        chosen = {k: given[k] for k in OWN if given.get(k) is not None}
+        for key in ("raster", "dtm"):
+            if key not in chosen:
+                raise BadConfig(f"train.own: {name} has no {key}")
+        if ("truth" in chosen) == ("buildings" in chosen):
+            raise BadConfig(f"train.own: {name} needs either truth (roof sections) or buildings (outlines)")
+        own[name] = chosen
+    if not own and not train["data"] and not train["tiles"]:
+        raise BadConfig("train: nothing to learn from: give own, data or tiles")
+
+    options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
+    options += [f"--family={train['family']}"]
+    options += [f"--{key}={train[key]}" for key in ("data", "steps") if train[key] is not None]
+    for key in ("cities", "leave_out"):
+        if train[key]:
+            options += [f"--{key.replace('_', '-')}", *map(str, train[key])]
+    if train["shares"]:
+        options.append("--shares=" + ",".join(f"{k}={v}" for k, v in train["shares"].items()))
+    if train["scene"]:
+        scene = settings_of(train["scene"], "scene")
+        if scene.get("view_azimuth") is None or scene.get("view_elevation") is None:
+            raise BadConfig(f"train.scene: {train['scene']} has no view_azimuth and view_elevation to simulate for")
+        options += [f"--{k.replace('_', '-')}={scene[k]}" for k in ANGLES if scene.get(k) is not None]
+    exports = EXPORTS[train["family"]]
+    training = {}
+    for network in exports:
+        init = [f"--init={weights(train['init'], network, base)}"] if train["init"] else []
+        training[network] = [*options, f"--task={network}", *init]
+    network_of = {task: network for network, tasks in exports.items() for task in tasks}
+    return Recipe(str(train["name"]), network_of, own, training)
+
+
+def own_options(given: dict[str, Any], split: str, seed: int) -> list[str]:
+    """The options of `learn.own` for one data set."""
+    listed = {k: ",".join(map(str, v)) if isinstance(v, list) else v for k, v in given.items()}
+    if "buildings" in listed:
+        listed = {k: v for k, v in listed.items() if not k.startswith("truth")}
+    return [f"--{k.replace('_', '-')}={v}" for k, v in listed.items()] + [f"--split={split}", f"--seed={seed}"]
+
+
+def weights(init: str, network: str, base: Path) -> Path:
+    """The weights to start from: a file, or of a model set its `NETWORK.pt`, `weights.pt` or only `.pt` file."""
+    if Path(init).is_file():
+        return Path(init)
+    folder = base / "models" / init
+    folder = folder if folder.is_dir() else Path(init)
+    named = [folder / f"{network}.pt", folder / "weights.pt"]
+    found = [f for f in named if f.is_file()] or sorted(folder.glob("*.pt"))
+    if not found or (len(found) > 1 and found[0] not in named):
+        raise BadConfig(f"train.init: {init} is no file, and {folder} holds no {network}.pt or weights.pt")
+    return found[0]

@@ -1,0 +1,194 @@
+"""Sources: what a training run learns from, gathered from command-line options.
+
+Simulated tiles come from a pool that a background process renders while training goes on; roof photographs and chips from a
+data folder; a user's own samples from the folders `learn.own` writes. Out: an endless mixture of training tiles, validation
+tiles, and what a contract must say of the data: names, licence, angles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from kibs_steps import store
+from kibs_steps.learn import dataset
+from kibs_steps.simulate import citymodel, draped
+
+NAMES = ("simulated", "pasted", "chips", "own")
+SHARES = {"simulated": 0.62, "pasted": 0.23, "chips": 0.15, "own": 0.3}  # of those there are, scaled to sum to 1
+NON_COMMERCIAL = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
+SIMULATED = "MIT, as the code: trained on simulated scenes only"
+OWN = "as the owner of the training data decides"
+HELD_OUT = 900_000  # seeds of simulated validation tiles begin here
+TOLD_ANGLES = 3.0  # deg: how far from the one view of its training a fine-tuned model may be used
+
+
+class Sources(NamedTuple):
+    """Training tiles, validation samples, and `trained_on` of the contract (with `corner_heights`: mean, σ in m)."""
+
+    mixture: dataset.Mixture
+    validation: list[dataset.Sample]
+    about: dict[str, Any]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options that say what to learn from."""
+    parser.add_argument("--data", help="data folder with roofgraph/roofgraph.tar and chips/; none: no photographs")
+    parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
+    parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
+    parser.add_argument("--own", nargs="*", default=[], help="folders of own samples (learn.own)")
+    parser.add_argument("--pool", help="folder of simulated tiles, shared between runs (default: OUT/../pool)")
+    parser.add_argument("--tiles", type=int, default=4000, help="simulated tiles to render into the pool (0: none)")
+    parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that simulated tiles show parts of")
+    parser.add_argument("--shares", type=shares, default={}, help="as in simulated=0.5,pasted=0.2,chips=0.1,own=0.2")
+    parser.add_argument("--validation", type=int, default=0, help="simulated validation tiles, besides the own ones")
+    for name in ("view", "sun"):
+        parser.add_argument(f"--{name}-azimuth", type=float, help="simulate for one scene: its angle, deg")
+        parser.add_argument(f"--{name}-elevation", type=float)
+
+
+def shares(text: str) -> dict[str, float]:
+    """Shares by source, of `name=number,…`."""
+    found = dict(part.split("=") for part in text.split(",") if part)
+    if unknown := set(found) - set(NAMES):
+        raise argparse.ArgumentTypeError(f"no source {sorted(unknown)}: they are {', '.join(NAMES)}")
+    return {name: float(value) for name, value in found.items()}
+
+
+def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_needed: bool = False) -> Sources:
+    """Sources of a run with tiles of `size` px; starts rendering.
+
+    `upright`: tiles as dense networks see them; else turned at random. `heights_needed`: leave out what has no heights. Raises
+    `NoTrainingData`.
+    """
+    pool = Path(args.pool) if args.pool else Path(args.out).parent / "pool"
+    graphs, chips = [], []
+    if args.data:
+        data = Path(args.data)
+        roof_graphs = args.roofgraph or data / "roofgraph" / "roofgraph.tar"
+        graphs = dataset.read_roof_graphs(roof_graphs)
+        chips = [c for c in dataset.read_chips(data / "chips") if c.name.split("/")[0] not in args.leave_out]
+    training = [graph for graph in graphs if not dataset.held_out(graph)]
+    own = [path for folder in args.own for path in sorted(Path(folder, "training").glob("[!.]*.npz"))]
+    if args.own and not own:
+        raise dataset.NoTrainingData(
+            f"no training samples in {', '.join(args.own)}: make them with kibs_steps.learn.own"
+        )
+    view = _direction(args.view_azimuth, args.view_elevation)
+    sun = _direction(args.sun_azimuth, args.sun_elevation)
+    if args.tiles:
+        cities = tuple(map(citymodel.read, args.cities))
+        houses = draped.houses(training, draped.read_heights(roof_graphs)) if training else []
+        look = (args.tiles, args.seed, chips, view, sun, cities, houses)
+        multiprocessing.get_context("fork").Process(target=fill_pool, args=(pool, *look), daemon=True).start()
+    wanted = {**SHARES, **args.shares}
+    if heights_needed:
+        wanted |= {"pasted": 0.0, "chips": 0.0}
+    mixture = dataset.Mixture(pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright)
+    if args.tiles and not own and not chips:
+        _wait_for_first(pool)
+    kept = [path for folder in args.own for path in sorted(Path(folder, "validation").glob("[!.]*.npz"))]
+    validation = [dataset.load(path) for path in kept]
+    validation += [
+        dataset.simulated(np.random.default_rng([args.seed, HELD_OUT + i]), view=view, sun=sun)
+        for i in range(args.validation)
+    ]
+    validation = [prepared(sample, size, upright) for sample in validation]
+    simulates = bool(args.tiles) or any(pool.glob("[!.]*.npz"))
+    return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
+
+
+def prepared(sample: dataset.Sample, size: int, upright: bool) -> dataset.Sample:
+    """The middle of a validation sample, upright if the network sees it so."""
+    rows, cols = sample.labels.shape
+    part = dataset.window(sample, (rows - size) // 2, (cols - size) // 2, size)
+    return dataset.upright(part, np.random.default_rng(0)) if upright else part
+
+
+def about(
+    args: argparse.Namespace,
+    simulates: bool,
+    graphs: bool,
+    chips: bool,
+    view: tuple[float, float] | None,
+    sun: tuple[float, float] | None,
+) -> dict[str, Any]:
+    """`trained_on` of the contract: data and licence of the sources used, angles, and heights of own corners."""
+    data = ["simulated scenes"] if simulates else []
+    data += [f"simulated scenes of the city in {Path(city).name}" for city in args.cities]
+    data += ["roof-graph photographs (Ren et al. 2021), pasted"] if graphs else []
+    without = f", without {', '.join(args.leave_out)}" if args.leave_out else ""
+    data += [f"chips with building masks{without}"] if chips else []
+    data += [f"own samples: {Path(folder).name}" for folder in args.own]
+    licence = NON_COMMERCIAL if graphs or chips else OWN if args.own else SIMULATED
+    found: dict[str, Any] = {"data": data, "licence": licence}
+    records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
+    for name, direction in (("view", view), ("sun", sun)):
+        # Simulated tiles show all directions unless one is asked for; own ones alone show theirs.
+        shown = [direction] if simulates else [tuple(r[name]) if r[name] else None for r in records]
+        if simulates and direction is None:
+            continue
+        found |= told(name, shown)
+    records = [record["corners"] for record in records]
+    known = [record for record in records if record["count"]]
+    if known:
+        count = sum(r["count"] for r in known)
+        mean = sum(r["count"] * r["mean_height"] for r in known) / count
+        variance = sum(r["count"] * (r["sigma"] ** 2 + (r["mean_height"] - mean) ** 2) for r in known) / count
+        found["corner_heights"] = [mean, float(np.sqrt(variance))]
+    return found
+
+
+def told(name: str, shown: list[tuple[float, float] | None]) -> dict[str, list[float] | None]:
+    """The ranges (deg) of a contract for tiles shown from these directions (azimuth, elevation); None: no range is known."""
+    if not shown or None in shown:
+        return {f"{name}_azimuth": None, f"{name}_elevation": None}
+    azimuth, elevation = np.array(shown).T
+    turned = (azimuth - azimuth[0] + 180) % 360 - 180 + azimuth[0]
+    around = [float((turned.min() - TOLD_ANGLES) % 360), float((turned.max() + TOLD_ANGLES) % 360)]
+    high = float(min(elevation.max() + TOLD_ANGLES, 90.0))
+    return {f"{name}_azimuth": around, f"{name}_elevation": [float(elevation.min() - TOLD_ANGLES), high]}
+
+
+def _direction(azimuth: float | None, elevation: float | None) -> tuple[float, float] | None:
+    return None if azimuth is None or elevation is None else (azimuth % 360, elevation)
+
+
+def fill_pool(
+    pool: Path,
+    count: int,
+    seed: int,
+    chips: list[dataset.Chip],
+    view: tuple[float, float] | None = None,
+    sun: tuple[float, float] | None = None,
+    cities: Sequence[citymodel.CityModel] = (),
+    houses: Sequence[draped.House] = (),
+) -> None:
+    """Render simulated tiles into a folder until it holds `count`, leaving what is there."""
+    os.nice(10)
+    cv2.setNumThreads(1)
+    backgrounds = [(chip.rgb, ~chip.building) for chip in chips]
+    pool.mkdir(parents=True, exist_ok=True)
+    for number in range(count):
+        path = pool / f"{seed}-{number:06d}.npz"
+        if not path.exists():
+            rng = np.random.default_rng([seed, number])
+            sample = dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities, houses=houses)
+            dataset.save(path, sample)
+
+
+def _wait_for_first(pool: Path, seconds: float = 600.0) -> None:
+    """Wait until the pool holds a tile. Raises `NoTrainingData` when none comes."""
+    end = time.monotonic() + seconds
+    while not any(pool.glob("[!.]*.npz")):
+        if time.monotonic() > end:
+            raise dataset.NoTrainingData(f"{pool} is still empty after {seconds:g} s: rendering does not work here")
+        time.sleep(0.2)

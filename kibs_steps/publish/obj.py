@@ -1,0 +1,65 @@
+"""OBJ: `city.obj`, the city as plain text: an object per building, a group per kind of surface.
+
+In: the blocks' solids. Out: Wavefront OBJ in metres, x east, y north, z up, from the origin named in its head, and `city.mtl`,
+the
+colours of its three materials.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from kibs_steps import cli, store
+from kibs_steps import scene as scenes
+from kibs_steps.publish.glb import origin_of
+from kibs_steps.publish.mesh import COLOURS, KINDS, Mesh, indexed, meshes
+
+
+def write(out: TextIO, found: Iterable[Mesh], origin: np.ndarray, crs: str, materials: str) -> None:
+    """Write buildings; `origin` (3,) map m."""
+    out.write(f"# origin {origin[0]:.0f} {origin[1]:.0f} {origin[2]:.0f} in {crs.splitlines()[0]}, metres, z up\n")
+    out.write(f"mtllib {materials}\n")
+    used = 0
+    for mesh in found:
+        points, faces, kind = indexed(mesh, origin)
+        out.write(f"o building-{mesh.building}\n")
+        np.savetxt(out, points, fmt="v %.3f %.3f %.3f")
+        for k, name in enumerate(KINDS):
+            mine = faces[kind[faces[:, 0]] == k]
+            if len(mine):
+                out.write(f"g {name}\nusemtl {name}\n")
+                np.savetxt(out, mine + used + 1, fmt="f %d %d %d")
+        used += len(points)
+
+
+def materials() -> str:
+    """The colours of the kinds of surface as MTL."""
+    lines = (
+        f"newmtl {name}\nKd {r / 255:.3f} {g / 255:.3f} {b / 255:.3f}\n"
+        for name, (r, g, b) in zip(KINDS, COLOURS, strict=True)
+    )
+    return "".join(lines)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Write the city as Wavefront OBJ."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.obj", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--solids", nargs="+", required=True, help="solids.city.jsonl of every block")
+    parser.add_argument("--out", required=True, help="out: city.obj")
+    parser.add_argument("--materials", required=True, help="out: city.mtl, beside it")
+    args = parser.parse_args(argv)
+    scene = scenes.read(args.scene)
+    with store.whole(args.materials) as temporary:
+        temporary.write_text(materials(), encoding="utf-8")
+    with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
+        write(out, meshes(args.solids), origin_of(scene), scene.grid.crs, Path(args.materials).name)
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,176 @@
+"""3D Tiles: `tiles3d/`, the city for web globes (3D Tiles 1.1): squares of the map as GLB, placed on the Earth.
+
+In: the blocks' solids. Out: `tileset.json` and one GLB per square of `SIDE` metres. Every vertex is brought to geocentric
+coordinates
+by PROJ and stored in the local east-north-up frame of the scene's centre, so that the grid's convergence and scale are right; the
+tileset's transform places that frame. Each vertex carries the number of its building (EXT_mesh_features), and a property
+table says which that is (EXT_structural_metadata: `building_id, height, ground_z, volume`). Without a vertical CRS heights
+count from the ellipsoid.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections import OrderedDict, defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import trimesh
+
+from kibs_steps import cli, store
+from kibs_steps import scene as scenes
+from kibs_steps.publish import licences
+from kibs_steps.publish.glb import matt, y_up
+from kibs_steps.publish.mesh import COLOURS, Mesh, indexed, meshes
+
+SIDE = 256.0  # m
+GEOCENTRIC = "EPSG:4978"
+NUMBERS = {"building_id": np.uint32, "height": np.float32, "ground_z": np.float32, "volume": np.float32}
+
+
+class Earth:
+    """From map metres to the east-north-up frame of a place on the Earth."""
+
+    def __init__(self, crs: str, vertical: str | None, x: float, y: float) -> None:
+        known = pyproj.CRS.from_user_input(crs)
+        if vertical is None:
+            whole = known.to_3d()
+        else:
+            up = pyproj.CRS.from_user_input(vertical)
+            whole = pyproj.crs.CompoundCRS(f"{known.name} + {up.name}", [known, up])
+        self.geocentric = pyproj.Transformer.from_crs(whole, GEOCENTRIC, always_xy=True)
+        degrees = pyproj.Transformer.from_crs(known, known.geodetic_crs, always_xy=True)
+        lon, lat = np.radians(degrees.transform(x, y))
+        east = [-np.sin(lon), np.cos(lon), 0.0]
+        north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
+        up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+        self.axes = np.array([east, north, up])
+        self.origin = np.array(self.geocentric.transform(x, y, 0.0))
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """East, north, up (n, 3) in metres of map points (n, 3)."""
+        return (np.column_stack(self.geocentric.transform(*points.T)) - self.origin) @ self.axes.T
+
+    @property
+    def transform(self) -> list[float]:
+        """The frame's place as a 4×4 matrix, column by column."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.axes.T, self.origin
+        return matrix.T.ravel().tolist()
+
+
+def content(found: list[Mesh], earth: Earth) -> tuple[bytes, np.ndarray]:
+    """The GLB of some buildings and their bounds (2, 3) in the local frame."""
+    every, faces, colours, number = [], [], [], []
+    used = 0
+    for k, mesh in enumerate(found):
+        base = np.floor(mesh.triangles.reshape(-1, 3).min(axis=0))
+        points, index, kind = indexed(mesh, base)
+        every.append(earth.local(points + base))
+        faces.append(index + used)
+        colours.append(COLOURS[kind])
+        number.append(np.full(len(points), k, np.float32))
+        used += len(points)
+    points, colour = np.concatenate(every), np.concatenate(colours)
+    centre = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
+    body = trimesh.Trimesh(
+        y_up(points - centre),
+        np.concatenate(faces),
+        vertex_colors=np.column_stack([colour, np.full(len(colour), 255, np.uint8)]),
+        vertex_attributes={"_FEATURE_ID_0": np.concatenate(number)},
+        process=False,
+    )
+    world = trimesh.Scene()
+    world.add_geometry(
+        body,
+        node_name="buildings",
+        geom_name="buildings",
+        transform=trimesh.transformations.translation_matrix(y_up(centre[None])[0]),
+    )
+
+    def tables(buffers: OrderedDict[Any, bytes], tree: dict[str, Any]) -> None:
+        columns = {}
+        for name, kind in NUMBERS.items():
+            values = [mesh.building if name == "building_id" else mesh.attributes.get(name) or 0.0 for mesh in found]
+            buffers[f"property {name}"] = _padded(np.array(values, kind).tobytes())
+            columns[name] = {"values": len(buffers) - 1}
+        table = {"name": "buildings", "class": "building", "count": len(found), "properties": columns}
+        types = {np.uint32: "UINT32", np.float32: "FLOAT32"}
+        properties = {name: {"type": "SCALAR", "componentType": types[kind]} for name, kind in NUMBERS.items()}
+        schema = {"id": "kibs", "classes": {"building": {"properties": properties}}}
+        tree["extensions"] = {"EXT_structural_metadata": {"schema": schema, "propertyTables": [table]}}
+
+    def finish(tree: dict[str, Any]) -> None:
+        matt(tree)
+        tree["extensionsUsed"] = ["EXT_mesh_features", "EXT_structural_metadata"]
+        ids = {"featureCount": len(found), "attribute": 0, "propertyTable": 0}
+        tree["meshes"][0]["primitives"][0]["extensions"] = {"EXT_mesh_features": {"featureIds": [ids]}}
+
+    glb = trimesh.exchange.gltf.export_glb(
+        world, include_normals=False, tree_postprocessor=finish, buffer_postprocessor=tables
+    )
+    return glb, np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _padded(values: bytes) -> bytes:
+    """Bytes up to a multiple of 8, as property tables must start."""
+    return values + b"\0" * (-len(values) % 8)
+
+
+def box(bounds: np.ndarray) -> dict[str, list[float]]:
+    """A bounding volume: centre and half axes of an upright box; bounds (2, 3)."""
+    half = np.maximum((bounds[1] - bounds[0]) / 2, 0.5)
+    return {"box": [round(float(v), 3) for v in (*bounds.mean(axis=0), half[0], 0, 0, 0, half[1], 0, 0, 0, half[2])]}
+
+
+def write(folder: Path, found: Iterable[Mesh], earth: Earth, asset: dict[str, Any]) -> None:
+    """Write the tileset into a new folder; one square of the map is held in memory at a time but for its place."""
+    squares: dict[tuple[int, int], list[Mesh]] = defaultdict(list)
+    for mesh in found:
+        middle = mesh.triangles.reshape(-1, 3)[:, :2].mean(axis=0)
+        squares[tuple(int(v) for v in middle // SIDE)].append(mesh)
+    children, bounds = [], []
+    for place in sorted(squares):
+        glb, extent = content(squares[place], earth)
+        name = f"{place[0]}_{place[1]}.glb"
+        (folder / name).write_bytes(glb)
+        children.append({"boundingVolume": box(extent), "geometricError": 0.0, "content": {"uri": name}})
+        bounds.append(extent)
+    whole = np.stack([np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]]) if bounds else np.zeros((2, 3))
+    error = round(float(np.linalg.norm(whole[1] - whole[0])), 3)
+    root = {"transform": earth.transform, "boundingVolume": box(whole), "geometricError": error, "refine": "ADD"}
+    if children:
+        root["children"] = children
+    tileset = {"asset": {"version": "1.1", **asset}, "geometricError": 2 * error, "root": root}
+    (folder / "tileset.json").write_text(json.dumps(tileset, indent=1) + "\n", encoding="utf-8")
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Write the city as 3D Tiles."""
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.tiles3d", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--solids", nargs="+", required=True, help="solids.city.jsonl of every block")
+    parser.add_argument("--models", nargs="*", default=[], help="models/*.json: their licences go into the asset")
+    parser.add_argument("--out", required=True, help="out: tileset.json in a folder of its own")
+    args = parser.parse_args(argv)
+    scene = scenes.read(args.scene)
+    left, bottom, right, top = scene.grid.bounds
+    vertical = store.read_json(args.scene).get("vertical_crs")
+    earth = Earth(scene.grid.crs, vertical, (left + right) / 2, (bottom + top) / 2)
+    told = {"title": scene.name, "licence": licences.line(args.models)}
+    folder = Path(args.out).parent
+    making = folder.with_name(f".tmp-{folder.name}")
+    shutil.rmtree(making, ignore_errors=True)
+    making.mkdir(parents=True)
+    write(making, meshes(args.solids), earth, {"extras": {k: v for k, v in told.items() if v}})
+    shutil.rmtree(folder, ignore_errors=True)
+    making.rename(folder)
+
+
+if __name__ == "__main__":
+    cli.run(main)

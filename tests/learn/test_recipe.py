@@ -1,0 +1,75 @@
+"""From `train` in the configuration to the options of the programs."""
+
+import pytest
+
+from kibs_steps.learn import recipe
+from kibs_steps.plan import BadConfig
+
+TOWN = {"raster": "t.tif", "dtm": 100, "truth": "t.gpkg", "view_azimuth": 181.1, "view_elevation": 59.3, "models": "x"}
+
+
+def test_defaults_train_the_dense_network_once_for_three_models(tmp_path):
+    found = recipe.recipe({}, tmp_path)
+    assert found.name == "mine"
+    assert set(found.training) == {"both"}
+    assert found.network_of == {"both": "both", "sections": "both", "corners": "both"}
+    assert "--family=dense" in found.training["both"]
+    assert not [o for o in found.training["both"] if o.startswith(("--view", "--init", "--data"))]
+
+
+def test_the_papers_pair_is_two_networks(tmp_path):
+    found = recipe.recipe({"train": {"family": "maskrcnn", "name": "paper"}}, tmp_path)
+    assert found.network_of == {"sections": "sections", "corners": "corners"}
+    assert "--task=corners" in found.training["corners"]
+
+
+def test_own_data_of_a_scene_and_of_its_own(tmp_path):
+    outlines = {"name": "roofs", "raster": "r.tif", "dtm": "d.tif", "buildings": "b.gpkg", "bands": [5, 3, 2]}
+    config = {
+        "scenes": {"town": TOWN},
+        "truth_frame": "image",
+        "train": {"own": ["town", outlines], "split": "shuffle"},
+    }
+    found = recipe.recipe(config, tmp_path)
+    assert list(found.own) == ["town", "roofs"]
+    options = recipe.own_options(found.own["town"], "shuffle", 3)
+    assert {"--raster=t.tif", "--dtm=100", "--truth=t.gpkg", "--truth-frame=image", "--view-azimuth=181.1"} <= set(
+        options
+    )
+    assert {"--split=shuffle", "--seed=3"} <= set(options)
+    assert not [o for o in options if "models" in o]
+    options = recipe.own_options(found.own["roofs"], "blocks", 0)
+    assert "--bands=5,3,2" in options
+    assert not [o for o in options if o.startswith("--truth")]
+
+
+def test_fine_tuning_takes_the_scenes_angles_and_the_sets_weights(tmp_path):
+    folder = tmp_path / "models/free"
+    folder.mkdir(parents=True)
+    (folder / "weights.pt").touch()
+    config = {
+        "scenes": {"town": TOWN},
+        "train": {"scene": "town", "init": "free", "shares": {"simulated": 0.5, "own": 0.5}},
+    }
+    options = recipe.recipe(config, tmp_path).training["both"]
+    assert {"--view-azimuth=181.1", "--view-elevation=59.3", f"--init={folder / 'weights.pt'}"} <= set(options)
+    assert "--shares=simulated=0.5,own=0.5" in options
+    (folder / "both.pt").touch()
+    assert recipe.weights("free", "both", tmp_path) == folder / "both.pt"
+    assert recipe.weights(str(folder / "weights.pt"), "both", tmp_path) == folder / "weights.pt"
+
+
+@pytest.mark.parametrize(
+    ("train", "message"),
+    [
+        ({"own": ["nowhere"]}, "no scene 'nowhere'"),
+        ({"own": [{"raster": "a.tif", "dtm": 1}]}, "truth .* or buildings"),
+        ({"own": [{"raster": "a.tif", "truth": "t.gpkg"}]}, "has no dtm"),
+        ({"scene": "plain"}, "view_azimuth"),
+        ({"init": "nothing"}, r"nothing is no file"),
+        ({"tiles": 0}, "nothing to learn from"),
+    ],
+)
+def test_what_cannot_be_trained_is_said(tmp_path, train, message):
+    with pytest.raises(BadConfig, match=message):
+        recipe.recipe({"scenes": {"plain": {"raster": "t.tif"}}, "train": train}, tmp_path)

@@ -1,0 +1,86 @@
+"""What a run learns from, and what its contract then says."""
+
+import argparse
+
+import numpy as np
+import pytest
+
+from kibs_steps import store
+from kibs_steps.learn import dataset, sources
+
+
+def arguments(*words):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", default="runs/x/both")
+    parser.add_argument("--seed", type=int, default=0)
+    sources.add_arguments(parser)
+    return parser.parse_args(list(words))
+
+
+def own(folder, view=(120.0, 65.0), count=10, mean=5.0, sigma=1.0):
+    """A folder as `learn.own` leaves it: four training tiles, one to validate on, the record."""
+    for name, n in (("training", 4), ("validation", 1)):
+        for i in range(n):
+            sample = dataset.empty(np.full((64, 64, 3), 10 * i, np.uint8))
+            sample.labels[10:30, 10:40] = 1
+            dataset.save(folder / name / f"r000c{i:03d}.npz", sample)
+    corners = {"count": count, "mean_height": mean, "sigma": sigma}
+    store.write_json(folder / "own.json", {"view": view and list(view), "sun": None, "corners": corners})
+    return folder
+
+
+def test_own_samples_alone(tmp_path):
+    folder = own(tmp_path / "town")
+    found = sources.gather(arguments("--own", str(folder), "--tiles=0", f"--out={tmp_path}/run/both"), 48)
+    assert len(found.validation) == 1
+    assert found.validation[0].labels.shape == (48, 48)
+    assert {tuple(np.unique(found.mixture[i].labels)) for i in range(8)} <= {(0, 1), (0,)}
+    assert found.mixture[3].rgb.shape == (48, 48, 3)
+    about = found.about
+    assert about["licence"] == sources.OWN
+    assert about["view_azimuth"] == [117.0, 123.0]
+    assert about["view_elevation"] == [62.0, 68.0]
+    assert about["sun_azimuth"] is None
+    assert about["corner_heights"] == [5.0, 1.0]
+
+
+def test_corner_heights_of_several_data_sets_are_pooled(tmp_path):
+    one = own(tmp_path / "a", count=30, mean=4.0, sigma=1.0)
+    other = own(tmp_path / "b", view=None, count=10, mean=8.0, sigma=2.0)
+    about = sources.gather(arguments("--own", str(one), str(other), "--tiles=0"), 48).about
+    values = np.concatenate([np.tile([3.0, 5.0], 15), np.tile([6.0, 10.0], 5)])
+    assert about["corner_heights"] == pytest.approx([values.mean(), values.std()])
+    assert about["view_elevation"] is None  # one of them does not tell its view
+
+
+@pytest.mark.parametrize(
+    ("shown", "azimuth", "elevation"),
+    [
+        ([(10.0, 60.0)], [7.0, 13.0], [57.0, 63.0]),
+        ([(1.0, 89.0)], [358.0, 4.0], [86.0, 90.0]),
+        ([(350.0, 60.0), (20.0, 70.0)], [347.0, 23.0], [57.0, 73.0]),
+    ],
+)
+def test_ranges_span_what_was_shown(shown, azimuth, elevation):
+    told = sources.told("view", shown)
+    assert told["view_azimuth"] == pytest.approx(azimuth)
+    assert told["view_elevation"] == pytest.approx(elevation)
+
+
+def test_photographs_make_a_model_non_commercial():
+    plain = arguments("--tiles=10")
+    assert sources.about(plain, True, False, False, None, None)["licence"] == sources.SIMULATED
+    assert sources.about(plain, True, True, True, None, None)["licence"] == sources.NON_COMMERCIAL
+    assert "view_azimuth" not in sources.about(plain, True, False, False, None, None)
+    tuned = sources.about(plain, True, False, False, (181.0, 59.0), None)
+    assert tuned["view_elevation"] == [56.0, 62.0]
+
+
+def test_nothing_to_learn_from_is_said(tmp_path):
+    with pytest.raises(dataset.NoTrainingData, match="no training samples"):
+        sources.gather(arguments("--own", str(tmp_path), "--tiles=0"), 48)
+    empty = sources.gather(arguments("--tiles=0", f"--out={tmp_path}/run/both"), 48)
+    with pytest.raises(dataset.NoTrainingData, match="nothing to learn from"):
+        empty.mixture[0]
+    with pytest.raises(argparse.ArgumentTypeError, match="no source"):
+        sources.shares("simulatd=1")

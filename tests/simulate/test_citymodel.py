@@ -1,0 +1,124 @@
+"""A known house in, its sections, corners and heights out exactly, in every version and shape of the format."""
+
+import json
+import os
+from pathlib import Path
+
+import cities
+import numpy as np
+import pytest
+import shapely
+
+from kibs_steps.simulate import citymodel
+from kibs_steps.simulate.citymodel import UnusableCity
+from kibs_steps.zbuffer import Polygon
+
+SHIFT = (84000.0, 446000.0, -2.0)
+HOUSE = cities.gable(84010.0, 446020.0)
+
+
+def corners(faces):
+    return sorted(tuple(np.round(p, 6).tolist()) for face in faces for p in face.ring)
+
+
+@pytest.mark.parametrize("version", ["0.8", "1.1", "2.0"])
+@pytest.mark.parametrize("solid", [True, False])
+@pytest.mark.parametrize("semantics", [True, False])
+def test_a_gable_house_comes_out_as_it_went_in(tmp_path, version, solid, semantics):
+    path = cities.write(tmp_path / "c.json", [HOUSE], version=version, solid=solid, semantics=semantics, shift=SHIFT)
+    model = citymodel.read(path)
+    (building,) = model.buildings
+    assert model.crs == "EPSG:28992"
+    assert len(building.roofs) == 2
+    assert len(building.walls) == 4
+    assert building.base == pytest.approx(5.0)
+    assert building.centre == pytest.approx((84015.0, 446024.0))
+    expected = sorted(tuple(map(float, p)) for ring, kind in HOUSE if kind == "RoofSurface" for p in ring)
+    assert corners(building.roofs) == expected
+
+
+def test_a_sequence_is_the_same_city(tmp_path):
+    houses = [HOUSE, cities.gable(84040.0, 446020.0, 5.5)]
+    whole = citymodel.read(cities.write(tmp_path / "c.json", houses, shift=SHIFT))
+    parts = citymodel.read(cities.write_sequence(tmp_path / "c.jsonl", houses, shift=SHIFT))
+    assert [b.name for b in whole.buildings] == [b.name for b in parts.buildings] == ["b0", "b1"]
+    for a, b in zip(whole.buildings, parts.buildings, strict=True):
+        assert corners(a.roofs) == corners(b.roofs)
+
+
+def test_the_highest_detail_counts(tmp_path):
+    document = cities.document([HOUSE], shift=SHIFT)
+    part = document["CityObjects"]["b0-0"]
+    low = json.loads(json.dumps(part["geometry"][0]))
+    low["lod"] = "1.2"
+    low["boundaries"][0] = low["boundaries"][0][:1]
+    part["geometry"].insert(0, low)
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    assert len(citymodel.read(tmp_path / "c.json").buildings[0].roofs) == 2
+
+
+def test_neighbours_in_one_plane_are_one_section():
+    left = Polygon(np.array([[0, 0, 3], [4, 0, 3], [4, 2, 4.0], [4, 4, 5], [0, 4, 5]], float))
+    right = Polygon(np.array([[4, 0, 3], [9, 0, 3], [9, 4, 5], [4, 4, 5], [4, 2, 4]], float))
+    other = Polygon(np.array([[0, 4, 5], [9, 4, 5], [9, 8, 3], [0, 8, 3]], float))
+    found = citymodel.sections([left, right, other])
+    assert len(found) == 2
+    merged = next(f for f in found if f.ring[:, 1].min() == 0)
+    assert corners([merged]) == [(0, 0, 3), (0, 4, 5), (9, 0, 3), (9, 4, 5)]
+    # The same plane without a shared edge stays apart, and so does another height.
+    away = Polygon(right.ring + np.array([3.0, 0, 0]))
+    higher = Polygon(right.ring + np.array([0, 0, 0.3]))
+    assert len(citymodel.sections([left, away])) == 2
+    assert len(citymodel.sections([left, higher])) == 2
+
+
+def test_a_hole_stays_a_hole():
+    hole = np.array([[3, 3, 6], [3, 5, 6], [5, 5, 6], [5, 3, 6]], float)
+    (face,) = citymodel.sections([Polygon(np.array([[0, 0, 6], [9, 0, 6], [9, 9, 6], [0, 9, 6]], float), (hole,))])
+    assert len(face.holes) == 1
+    assert corners([Polygon(face.holes[0])]) == [(3, 3, 6), (3, 5, 6), (5, 3, 6), (5, 5, 6)]
+
+
+def test_a_bent_surface_becomes_planar_ones():
+    bent = Polygon(np.array([[0, 0, 3], [8, 0, 3], [8, 8, 3], [0, 8, 6]], float))
+    found = citymodel.sections([bent])
+    assert len(found) == 2
+    assert sum(shapely.Polygon(f.ring[:, :2]).area for f in found) == pytest.approx(64)
+    assert {p for f in found for p in corners([f])} == set(corners([bent]))
+
+
+@pytest.mark.parametrize(
+    ("text", "say"),
+    [
+        ("no json", "not JSON"),
+        ('{"type": "FeatureCollection"}', "not CityJSON"),
+        (json.dumps(cities.document([HOUSE], lod=1.2)), "LOD2"),
+        (json.dumps(cities.document([])), "LOD2"),
+    ],
+)
+def test_other_files_are_refused_by_name(tmp_path, text, say):
+    (tmp_path / "c.json").write_text(text)
+    with pytest.raises(UnusableCity, match=say):
+        citymodel.read(tmp_path / "c.json")
+    with pytest.raises(UnusableCity, match="cannot be read"):
+        citymodel.read(tmp_path / "none.json")
+
+
+@pytest.mark.skipif("KIBS_DATA" not in os.environ, reason="no real data: KIBS_DATA is not set")
+def test_sections_of_a_real_city_cover_its_roofs():
+    path = Path(os.environ["KIBS_DATA"]) / "citymodels/tile_901_trimmed.jsonl"
+    covered = 0.0
+    for line in path.read_text().splitlines()[1:]:
+        feature = json.loads(line)
+        vertices = np.array(feature["vertices"]) * 0.001
+        for item in feature["CityObjects"].values():
+            for g in item["geometry"]:
+                if float(g["lod"]) == 2.2:
+                    kinds = [s["type"] for s in g["semantics"]["surfaces"]]
+                    for rings, value in zip(g["boundaries"][0], g["semantics"]["values"][0], strict=True):
+                        if kinds[value] == "RoofSurface":
+                            outer, *holes = (vertices[r][:, :2] for r in rings)
+                            covered += shapely.Polygon(outer, holes).area
+    found = [f for b in citymodel.read(path).buildings for f in b.roofs]
+    area = sum(shapely.Polygon(f.ring[:, :2], [h[:, :2] for h in f.holes]).area for f in found)
+    assert area == pytest.approx(covered, rel=2e-4)

@@ -1,0 +1,124 @@
+"""Sections corrected by hand: what was not touched stays to the bit, what was gets the id one expects."""
+
+import geopandas
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import shapely
+import toy_city
+
+from kibs_steps import edited, store
+from kibs_steps.corners import CORNERS
+from kibs_steps.stitch import SECTIONS, section_ids
+
+
+@pytest.fixture
+def world(tmp_path):
+    """A scene, its stitched sections and corners, and the layer as it was published."""
+    facts = toy_city.make_scene(tmp_path)
+    outlines = np.array([shapely.box(c, 40, c + 20, 60).normalize() for c in (20, 41, 80, 120)])
+    ids = section_ids(outlines, facts.grid)
+    n = len(ids)
+    columns = [
+        ids,
+        shapely.to_wkb(outlines),
+        [0.9] * n,
+        [0, 1, 2, 2],
+        [False] * n,
+        [True, False, False, False],
+        [5, 6, 7, 8],
+    ]
+    stitched = pa.table([pa.array(c, f.type) for c, f in zip(columns, SECTIONS, strict=True)], schema=SECTIONS)
+    rows = [
+        (0, 0, x, y, 6.0, 0.5, 0.8, o)
+        for g, o in zip(outlines, (5, 6, 7, 8), strict=True)
+        for x, y in shapely.get_coordinates(g)[:-1]
+    ]
+    corners = pa.table(
+        [pa.array(c, f.type) for c, f in zip(zip(*rows, strict=True), CORNERS, strict=True)], schema=CORNERS
+    )
+    standing = shapely.transform(outlines, facts.grid.to_map)
+    layer = geopandas.GeoDataFrame({"section_id": ids}, geometry=standing, crs=toy_city.CRS)
+    return facts, stitched, corners, layer
+
+
+def run(tmp_path, world, layer, crs=None):
+    facts, stitched, corners, _ = world
+    (layer if crs is None else layer.to_crs(crs)).to_file(tmp_path / "edit.gpkg", layer="roof_sections_image")
+    store.write_by_block(tmp_path / "stitched.parquet", {"r000c000": stitched, "r000c001": stitched.slice(0, 0)})
+    store.write_table(tmp_path / "corners.parquet", corners)
+    out = tmp_path / "sections.parquet", tmp_path / "edited_corners.parquet"
+    edited.main(
+        ["--scene", str(facts.folder / "scene.json"), "--layer", str(tmp_path / "edit.gpkg"),
+         "--stitched", str(tmp_path / "stitched.parquet"),
+         "--found", str(tmp_path / "corners.parquet"), "--tile", "120", "--margin", "10", "--block", "1", "--reach", "7.5",
+         "--sections", str(out[0]), "--corners", str(out[1])]
+    )  # fmt: skip
+    return pq.read_table(out[0]), pq.read_table(out[1])
+
+
+def test_nothing_touched_is_nothing_changed(tmp_path, world):
+    sections, corners = run(tmp_path, world, world[3])
+    assert sections.select(SECTIONS.names).sort_by("section_id").equals(world[1].sort_by("section_id"))
+    assert set(corners["owner"].to_pylist()) == {5, 6, 7, 8}
+
+
+def test_blocks_are_by_the_ids_pixel(tmp_path, world):
+    sections, _ = run(tmp_path, world, world[3])
+    block = dict(zip(sections["section_id"].to_pylist(), sections["block"].to_pylist(), strict=True))
+    for section in block:
+        col = (section - 1) % toy_city.WIDTH
+        assert block[section] == f"r000c{col // 100:03d}"
+
+
+def test_moved_split_deleted_and_drawn(tmp_path, world):
+    facts, _, _, layer = world
+    ids = layer["section_id"].to_list()
+    to_map = facts.grid.to_map
+    drawn = shapely.transform(shapely.box(200, 100, 220, 130), to_map)
+    west, east = (shapely.transform(shapely.box(*b), to_map) for b in ((80, 40, 84, 60), (84, 40, 100, 60)))
+    stretched = shapely.transform(shapely.box(20, 40, 41, 60), to_map)
+    rows = [(ids[0], stretched), (ids[2], west), (ids[2], east), (ids[3], layer.geometry[3]), (None, drawn)]
+    frame = geopandas.GeoDataFrame(
+        {"section_id": [r[0] for r in rows]}, geometry=[r[1] for r in rows], crs=toy_city.CRS
+    )
+    sections, corners = run(tmp_path, world, frame)
+    found = {r["section_id"]: r for r in sections.to_pylist()}
+    assert len(found) == 5
+    assert ids[1] not in found
+    assert {ids[0], ids[2], ids[3]} <= set(found)
+    kept = shapely.from_wkb(found[ids[2]]["outline"])
+    col, row = (ids[2] - 1) % facts.grid.width, (ids[2] - 1) // facts.grid.width
+    assert shapely.contains_xy(kept, col + 0.5, row + 0.5)  # the half that holds the id's pixel
+    assert (found[ids[3]]["owner"], found[ids[3]]["split"]) == (8, 2)
+    assert (found[ids[0]]["owner"], found[ids[0]]["split"], found[ids[0]]["void"]) == (0, 0, True)
+    new = set(found) - set(ids)
+    assert len(new) == 2
+    assert set(corners["owner"].to_pylist()) == {0, 8}
+    again, _ = run(tmp_path, world, frame.iloc[::-1])
+    assert {r["section_id"] for r in again.to_pylist()} == set(found)
+
+
+def test_a_layer_in_degrees_is_brought_back(tmp_path, world):
+    sections, _ = run(tmp_path, world, world[3], "EPSG:4326")
+    assert set(sections["section_id"].to_pylist()) == set(world[3]["section_id"])
+    area = shapely.area(shapely.from_wkb(sections["outline"].to_pylist()))
+    np.testing.assert_allclose(area, 400.0, rtol=1e-3)
+
+
+def test_what_is_no_layer_of_polygons_is_refused(tmp_path, world):
+    grid = world[0].grid
+    with pytest.raises(edited.SectionsUnusable, match="cannot be read"):
+        edited.read(tmp_path / "none.gpkg", grid)
+    points = geopandas.GeoDataFrame(geometry=[shapely.Point(0, 0)], crs=toy_city.CRS)
+    points.to_file(tmp_path / "points.gpkg")
+    with pytest.raises(edited.SectionsUnusable, match="no polygons"):
+        edited.read(tmp_path / "points.gpkg", grid)
+
+
+def test_a_bowtie_becomes_its_larger_part(world):
+    grid = world[0].grid
+    assert edited._polygon(shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])).is_valid
+    assert edited._polygon(shapely.Polygon([(0, 0), (1, 1), (2, 2)])) is None
+    assert grid.width == toy_city.WIDTH

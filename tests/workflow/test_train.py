@@ -1,0 +1,89 @@
+"""`snakemake train` on a small user-style data set, and the workflow with what it made on another raster."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pyogrio
+import pytest
+
+pytest.importorskip("torch", reason="training needs the extra `learn` (torch)")
+pytest.importorskip("pycocotools", reason="training needs the extra `learn` (pycocotools)")
+
+from kibs_steps.models import contract
+from kibs_steps.simulate import scene as simulation
+
+ROOT = Path(__file__).parents[2]
+ANGLES = {"view_azimuth": 120.0, "view_elevation": 65.0, "sun_azimuth": 155.0, "sun_elevation": 45.0}
+
+
+def snakemake(folder: Path, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", "1", *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+    logs = "".join(f"{p}:\n{p.read_text()}" for p in folder.glob("runs/*/logs/*.log"))
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:] + logs[-3000:]
+    return done.stdout + done.stderr
+
+
+def test_train_on_own_data_then_build_another_raster(tmp_path):
+    for name, seed in (("known", 3), ("new", 4)):
+        angles = [f"--{k.replace('_', '-')}={v}" for k, v in ANGLES.items()]
+        size = [f"--seed={seed}", "--size=340", "--style=suburb", f"--out={tmp_path / name}"]
+        simulation.main([*size, *angles])
+    scene = {"raster": "known/scene.tif", "dtm": "known/dtm.tif", "truth": "known/truth.gpkg", **ANGLES}
+    train = {"name": "town", "own": ["known"], "split": "shuffle", "tiles": 0, "steps": 20, "minutes": 30}
+    # A scene's models are looked for when Snakemake starts, so the configuration of training names the shipped ones.
+    (tmp_path / "config.yaml").write_text(json.dumps({"scenes": {"known": scene}, "train": train}))
+    snakemake(tmp_path, "train")
+    record = json.loads((tmp_path / "runs/town/own/known/own.json").read_text())
+    assert record["split"] | {"tiles": 0} == {
+        "rule": "shuffle",
+        "seed": 0,
+        "shares": [0.6, 0.2, 0.2],
+        "tile": 320,
+        "tiles": 0,
+    }
+    for task in ("sections", "corners", "both"):
+        made = contract.load(tmp_path / "models/town" / f"{task}.onnx", task)
+        trained = made.contract["trained_on"]
+        assert trained["data"] == ["own samples: known"]
+        assert trained["view_elevation"] == [62.0, 68.0]
+        assert "owner" in trained["licence"]
+        if task != "sections":
+            assert made.contract["heights"]["fallback"] == round(record["corners"]["mean_height"], 2)
+    assert "own samples: known" in (tmp_path / "models/town/README.md").read_text()
+    assert (tmp_path / "models/town/curves.png").stat().st_size > 1000
+    assert json.loads((tmp_path / "runs/town/both/done.json").read_text())["steps"] == 20
+
+    other = {**scene, **{key: scene[key].replace("known", "new") for key in ("raster", "dtm", "truth")}}
+    given = [f"{k}={v}" for k, v in {**other, "scene": "new", "models": "models/town", "method": "single"}.items()]
+    snakemake(tmp_path, "--config", *given)
+    assert (tmp_path / "results/new/evaluation.json").is_file()
+    assert {"roof_sections", "buildings"} <= {
+        name for name, _ in pyogrio.list_layers(tmp_path / "results/new/city.gpkg")
+    }
+    refused = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "snakemake",
+            "-s",
+            str(ROOT / "Snakefile"),
+            "-n",
+            "--config",
+            *given,
+            "view_elevation=80",
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert refused.returncode != 0
+    assert "outside what it was trained on" in refused.stdout + refused.stderr
