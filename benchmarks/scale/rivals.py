@@ -130,6 +130,7 @@ def law(sizes: list[float], seconds: list[float]) -> tuple[float, float]:
 
 def growth(labels: Callable[[int], np.ndarray], sides: list[int]) -> dict[str, Any]:
     """Seconds of `flooded` on label images (side, side) of the given sides, and the law through them (size in Mpx)."""
+    flooded(np.ones((2, 2), bool))  # imports what it needs
     sizes, seconds = [], []
     for side in sides:
         roofs = labels(side) > 0
