@@ -74,6 +74,12 @@ rule simulate:
         [p.raster for p in PLANS.values() if p.settings.get("simulate")],
 
 
+rule report:
+    """Write a page about every scene."""
+    input:
+        [f"results/{name}/report.html" for name in PLANS],
+
+
 rule verify:
     """Compare all files of every scene with their checksums, and take away what must be made again."""
     log:

@@ -24,11 +24,11 @@ from kibs_steps import plan as plans
 from kibs_steps.models import runtime
 from kibs_steps.plan import Plan
 
-# Seconds on one core per Mpx beside the networks, and per job; bytes on disk per pixel: measured on the demo (1.44 Mpx, 900
-# sections per km²) with benchmarks/steps.py. Planes and solids follow the number of roofs, so a dense town takes longer.
-SECONDS = {"tiles": 0.6, "sections": 1.6, "blend": 0.6, "corners": 0.3, "planes": 1.1, "ground": 0.4, "solids": 9.0}
-OTHER_SECONDS = 4.0  # stitch, buildings and the published files
-JOB_SECONDS = 0.9
+# Seconds on one core per Mpx beside the networks, and per job; bytes on disk per pixel. Planes, ground and buildings were timed on
+# the demo (1.44 Mpx of town), the others set so that the demo's whole time comes out: good for "minutes or hours", no more.
+SECONDS = {"tiles": 0.5, "sections": 2.0, "blend": 0.5, "corners": 0.5, "planes": 0.5, "ground": 0.3, "solids": 20.0}
+OTHER_SECONDS = 10.0  # stitch, buildings and the published files
+JOB_SECONDS = 0.6
 BYTES = {"blocks": 5.0, "published": 4.0}
 
 
@@ -133,7 +133,7 @@ def page(plan: Plan, results: Path, todo: Mapping[str, int]) -> str:
         "terrain": plan.dtm,
         "models": models,
         "to do": f"{waiting} of {len(plan.blocks)} blocks" if jobs else "nothing: all blocks are made",
-        "time": f"about {duration(needs.seconds)} on one core (an estimate: one tile was timed here"
+        "time": f"about {duration(needs.seconds)} on one core (a rough estimate: one tile was timed here"
         f"{'; fed truth needs no network' if fed else ''})",
         "disk": f"about {size(needs.size)} in {results / plan.name}",
     }

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kibs_steps import store
-from kibs_steps.errors import AGAIN
+from kibs_steps.errors import AGAIN, KibsError
 from kibs_steps.plan import BLOCK_STEPS, Plan
 
 LONGEST = 400  # characters of a reason
@@ -78,9 +78,9 @@ def publish_rest(
 ) -> bool:
     """Publish every scene without its failed blocks; whether that was worth trying and went well."""
     lost = [f for f in found if f.of_block]
-    if not lost or any(f.step in BLOCK_STEPS and not f.of_block for f in found):
-        return False
     by_scene = Counter(f.scene for f in lost)
+    if not lost or any(f.scene in by_scene and not f.of_block for f in found):
+        return False
     if all(by_scene[name] + len(p.left_out) >= len(p.blocks) for name, p in plans.items() if name in by_scene):
         return False
     leave_out = [f"{name}/{block}/{step}" for name, p in plans.items() for block, step in p.left_out.items()]
@@ -91,9 +91,18 @@ def publish_rest(
         store.write_json(path, dict(sorted(known.items())))
         leave_out += [f"{f.scene}/{f.block}/{f.step}" for f in lost if f.scene == name]
     print("Some blocks failed: the rest of the city is published without them.", file=sys.stderr, flush=True)
-    done = subprocess.run(command(argv, config, leave_out), check=False)
-    # The last thing the nested run does is to fail when it lost blocks of its own, so the record tells how it went.
-    return done.returncode == 0 or all((results / name / "run.json").is_file() for name in by_scene)
+    subprocess.run(command(argv, config, leave_out), check=False)
+    # That run fails too where it lost blocks of its own and published the rest without them: the record tells.
+    return all(_published(results / name) for name in by_scene)
+
+
+def _published(folder: Path) -> bool:
+    """Whether what is published says itself that it is made without the blocks that failed."""
+    try:
+        record = store.read_json(folder / "run.json")
+        return list(record["failed_blocks"]) == list(store.read_json(folder / RECORD))
+    except KibsError:
+        return False
 
 
 def told(found: list[Failure], published: bool, plans: dict[str, Plan], results: Path) -> str:

@@ -65,6 +65,7 @@ class Line(NamedTuple):
 
 def index_of(path: str | Path) -> tuple[list[Line], np.ndarray]:
     """The features of a CityJSONSeq and their vertices (n, 3), one after the other. Raises `store.DamagedFile`."""
+    sums.check(path)
     found, vertices = [], [np.zeros((0, 3), np.int64)]
     with open(path, "rb") as lines:
         offset = len(lines.readline())
@@ -88,6 +89,7 @@ def feature_at(line: Line) -> dict[str, Any]:
 
 def transform(path: str | Path) -> dict[str, Any]:
     """The transform in a CityJSONSeq's header. Raises `store.DamagedFile`."""
+    sums.check(path)
     with open(path, encoding="utf-8") as lines:
         try:
             return json.loads(lines.readline())["transform"]
@@ -115,8 +117,6 @@ def publish(paths: Sequence[str | Path], out: Path, sequence: Path, known: dict[
 
     Buildings are read one by one, twice; only the vertices of the whole city are held in memory.
     """
-    for path in paths:
-        sums.check(path)
     placed = transform(paths[0])
     lines: list[Line] = []
     every = []

@@ -22,37 +22,18 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
-MODULES = [
-    "scene",
-    "tiles",
-    "sections",
-    "blend",
-    "corners",
-    "truth",
-    "feed",
-    "stitch",
-    "planes",
-    "ground",
-    "buildings",
-    "solids",
-    "evaluate",
-    "verify",
-    "check",
-    "models.contract",
-    "publish.geopackage",
-    "publish.cityjson",
-    "publish.points",
-    "publish.rasters",
-    "publish.preview",
-    "publish.run",
-]
+MODULES = (
+    "scene tiles sections blend corners truth feed stitch planes ground buildings solids evaluate verify check models.contract "
+    "publish.geopackage publish.cityjson publish.points publish.rasters publish.preview publish.run publish.glb publish.obj "
+    "publish.tiles3d publish.ksr publish.dsm publish.viewer"
+)
 
 CALLER = """#!{python} -IS
-import json, os, socket, sys
+import json, os, shlex, socket, sys
 if sys.argv[1:2] != ["-m"]:
     os.execv({python!r}, sys.argv)
 with open({folder!r} + "/seen", "a") as seen:
-    seen.write(" ".join(sys.argv[2:]) + "\\n")
+    seen.write(shlex.join(sys.argv[2:]) + "\\n")
 caller = socket.socket(socket.AF_UNIX)
 caller.connect({folder!r} + "/socket")
 socket.send_fds(caller, [json.dumps([sys.argv[2:], os.getcwd()]).encode()], [1, 2])
@@ -102,7 +83,7 @@ def refuse(*_: object) -> None:
 
 def serve(folder: Path) -> None:
     """Fork a keeper for every caller, until the folder's socket goes away."""
-    for name in MODULES:
+    for name in MODULES.split():
         with contextlib.suppress(ModuleNotFoundError):
             import_module(f"kibs_steps.{name}")
     import geopandas  # noqa: F401 (steps import it where they use it)

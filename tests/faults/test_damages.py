@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 from importlib import import_module
 from pathlib import Path
@@ -82,7 +83,7 @@ def in_turn(town, monkeypatch, number: int, seed: int) -> dict[str, int]:
     """Damage file after file, each put back afterwards; how the steps that read it, and `verify`, took it."""
     monkeypatch.chdir(town.folder)
     rng = np.random.default_rng(seed)
-    commands = [line.split() for line in (town.folder / "commands").read_text().splitlines()]
+    commands = [shlex.split(line) for line in (town.folder / "commands").read_text().splitlines()]
     files = intermediates(town)
     backup = town.folder / "backup"
     shutil.copytree("results/town", backup)

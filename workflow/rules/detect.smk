@@ -23,6 +23,8 @@ rule sections:
         seams="results/{scene}/blocks/{block}/detected/seams.npz",
     log:
         "results/{scene}/logs/sections/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/sections/{block}.tsv"
     wildcard_constraints:
         scene=using("two_stage"),
     retries: 1
@@ -57,6 +59,8 @@ rule blend:
         temp("results/{scene}/blocks/{block}/blended.tif"),
     log:
         "results/{scene}/logs/blend/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/blend/{block}.tsv"
     retries: 1
     conda:
         RUN
@@ -82,6 +86,8 @@ rule corners:
         "results/{scene}/blocks/{block}/detected/corners.parquet",
     log:
         "results/{scene}/logs/corners/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/corners/{block}.tsv"
     wildcard_constraints:
         scene=using("two_stage"),
     retries: 1
@@ -123,6 +129,8 @@ rule single:
         corners="results/{scene}/blocks/{block}/detected/corners.parquet",
     log:
         "results/{scene}/logs/single/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/single/{block}.tsv"
     wildcard_constraints:
         scene=using("single"),
     retries: 1
@@ -155,6 +163,8 @@ rule truth:
         "results/{scene}/truth.parquet",
     log:
         "results/{scene}/logs/truth.log",
+    benchmark:
+        "results/{scene}/benchmarks/truth.tsv"
     retries: 1
     conda:
         RUN
@@ -188,6 +198,8 @@ rule feed:
         corners="results/{scene}/blocks/{block}/fed/corners.parquet",
     log:
         "results/{scene}/logs/feed/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/feed/{block}.tsv"
     retries: 1
     conda:
         RUN
@@ -218,6 +230,8 @@ rule stitch:
         corners="results/{scene}/stitched/corners.parquet",
     log:
         "results/{scene}/logs/stitch.log",
+    benchmark:
+        "results/{scene}/benchmarks/stitch.tsv"
     retries: 1
     conda:
         RUN

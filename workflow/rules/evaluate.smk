@@ -20,6 +20,8 @@ rule evaluation:
         picture="results/{scene}/evaluation.png",
     log:
         "results/{scene}/logs/evaluation.log",
+    benchmark:
+        "results/{scene}/benchmarks/evaluation.tsv"
     conda:
         RUN
     params:

@@ -16,6 +16,8 @@ rule geopackage:
         "results/{scene}/city.gpkg",
     log:
         "results/{scene}/logs/geopackage.log",
+    benchmark:
+        "results/{scene}/benchmarks/geopackage.tsv"
     conda:
         RUN
     params:
@@ -45,6 +47,8 @@ rule cityjson:
         sequence="results/{scene}/city.city.jsonl",
     log:
         "results/{scene}/logs/cityjson.log",
+    benchmark:
+        "results/{scene}/benchmarks/cityjson.tsv"
     conda:
         RUN
     params:
@@ -65,6 +69,8 @@ rule points:
         "results/{scene}/points.txt",
     log:
         "results/{scene}/logs/points.log",
+    benchmark:
+        "results/{scene}/benchmarks/points.tsv"
     conda:
         RUN
     params:
@@ -88,6 +94,8 @@ rule rasters:
         heights="results/{scene}/heights.tif",
     log:
         "results/{scene}/logs/rasters.log",
+    benchmark:
+        "results/{scene}/benchmarks/rasters.tsv"
     conda:
         RUN
     params:
@@ -110,6 +118,8 @@ rule preview:
         "results/{scene}/preview.png",
     log:
         "results/{scene}/logs/preview.log",
+    benchmark:
+        "results/{scene}/benchmarks/preview.tsv"
     conda:
         RUN
     params:
@@ -134,6 +144,8 @@ rule glb:
         "results/{scene}/city.glb",
     log:
         "results/{scene}/logs/glb.log",
+    benchmark:
+        "results/{scene}/benchmarks/glb.tsv"
     conda:
         RUN
     params:
@@ -157,6 +169,8 @@ rule obj:
         materials="results/{scene}/city.mtl",
     log:
         "results/{scene}/logs/obj.log",
+    benchmark:
+        "results/{scene}/benchmarks/obj.tsv"
     conda:
         RUN
     params:
@@ -179,6 +193,8 @@ rule tiles3d:
         "results/{scene}/tiles3d/tileset.json",
     log:
         "results/{scene}/logs/tiles3d.log",
+    benchmark:
+        "results/{scene}/benchmarks/tiles3d.tsv"
     conda:
         RUN
     params:
@@ -202,6 +218,8 @@ rule dsm:
         "results/{scene}/dsm.tif",
     log:
         "results/{scene}/logs/dsm.log",
+    benchmark:
+        "results/{scene}/benchmarks/dsm.tsv"
     conda:
         RUN
     params:
@@ -224,6 +242,8 @@ rule ksr:
         "results/{scene}/ksr/points.ply",
     log:
         "results/{scene}/logs/ksr.log",
+    benchmark:
+        "results/{scene}/benchmarks/ksr.tsv"
     conda:
         RUN
     params:
@@ -248,6 +268,8 @@ rule viewer:
         "results/{scene}/viewer.html",
     log:
         "results/{scene}/logs/viewer.log",
+    benchmark:
+        "results/{scene}/benchmarks/viewer.tsv"
     conda:
         RUN
     params:
@@ -272,6 +294,8 @@ rule paper_picture:
         "results/{scene}/paper.tif",
     log:
         "results/{scene}/logs/paper_picture.log",
+    benchmark:
+        "results/{scene}/benchmarks/paper_picture.tsv"
     conda:
         RUN
     params:
@@ -308,4 +332,27 @@ rule record:
     shell:
         "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} {params.remote:q} --models {input.models:q}"
         " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"
-        " {params.blocks:q} --out {output:q} > {log:q} 2>&1"
+        " {params.blocks:q} --benchmarks results/{wildcards.scene}/benchmarks --out {output:q} > {log:q} 2>&1"
+
+
+rule scene_report:
+    """report.html: one page about a scene."""
+    input:
+        record="results/{scene}/run.json",
+        preview="results/{scene}/preview.png",
+        evaluation=lambda w: (
+            [f"results/{w.scene}/evaluation.json"] if plan(w).truth else []
+        ),
+    output:
+        "results/{scene}/report.html",
+    log:
+        "results/{scene}/logs/report.log",
+    conda:
+        RUN
+    params:
+        signature=signature("run"),
+        evaluation=lambda w, input: (
+            ["--evaluation", input.evaluation] if plan(w).truth else []
+        ),
+    shell:
+        "python -m kibs_steps.publish.report --run {input.record:q} {params.evaluation:q} --out {output:q} > {log:q} 2>&1"

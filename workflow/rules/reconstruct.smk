@@ -20,6 +20,8 @@ rule edited:
         corners="results/{scene}/edited/corners.parquet",
     log:
         "results/{scene}/logs/edited.log",
+    benchmark:
+        "results/{scene}/benchmarks/edited.tsv"
     conda:
         RUN
     params:
@@ -46,6 +48,8 @@ rule surface:
         "results/{scene}/surface.tif",
     log:
         "results/{scene}/logs/surface.log",
+    benchmark:
+        "results/{scene}/benchmarks/surface.tsv"
     conda:
         RUN
     params:
@@ -81,6 +85,8 @@ rule planes:
         filed="results/{scene}/blocks/{block}/filed_corners.parquet",
     log:
         "results/{scene}/logs/planes/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/planes/{block}.tsv"
     retries: 1
     conda:
         RUN
@@ -109,6 +115,8 @@ rule ground:
         "results/{scene}/blocks/{block}/ground.parquet",
     log:
         "results/{scene}/logs/ground/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/ground/{block}.tsv"
     retries: 1
     conda:
         RUN
@@ -133,6 +141,8 @@ rule buildings:
         "results/{scene}/buildings.parquet",
     log:
         "results/{scene}/logs/buildings.log",
+    benchmark:
+        "results/{scene}/benchmarks/buildings.tsv"
     retries: 1
     conda:
         RUN
@@ -164,6 +174,8 @@ rule solids:
         attributes="results/{scene}/blocks/{block}/solids.parquet",
     log:
         "results/{scene}/logs/solids/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/solids/{block}.tsv"
     retries: 1
     conda:
         RUN

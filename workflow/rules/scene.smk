@@ -9,6 +9,8 @@ rule simulated:
         truth="results/{scene}/simulated/truth.gpkg",
     log:
         "results/{scene}/logs/simulated.log",
+    benchmark:
+        "results/{scene}/benchmarks/simulated.tsv"
     conda:
         RUN
     params:
@@ -38,6 +40,8 @@ rule scene:
         dtm="results/{scene}/dtm.tif",
     log:
         "results/{scene}/logs/scene.log",
+    benchmark:
+        "results/{scene}/benchmarks/scene.tsv"
     conda:
         RUN
     params:
@@ -69,6 +73,8 @@ rule tiled:
         temp("results/{scene}/tiled.tif"),
     log:
         "results/{scene}/logs/tiled.log",
+    benchmark:
+        "results/{scene}/benchmarks/tiled.tsv"
     conda:
         RUN
     params:
@@ -90,6 +96,8 @@ rule tiles:
         "results/{scene}/blocks/{block}/tiles.tif",
     log:
         "results/{scene}/logs/tiles/{block}.log",
+    benchmark:
+        "results/{scene}/benchmarks/tiles/{block}.tsv"
     retries: 1
     conda:
         RUN
@@ -113,6 +121,8 @@ rule model:
         "results/{scene}/models/{task}.json",
     log:
         "results/{scene}/logs/model_{task}.log",
+    benchmark:
+        "results/{scene}/benchmarks/model_{task}.tsv"
     localrule: True
     conda:
         RUN

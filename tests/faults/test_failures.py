@@ -1,0 +1,121 @@
+"""What a failed run says, and when it is worth publishing the rest."""
+
+from __future__ import annotations
+
+import subprocess
+from collections import namedtuple
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from kibs_steps import cli, errors, failures, store, verify
+from kibs_steps.failures import Failure
+
+Block = namedtuple("Block", "name")
+TOWN = SimpleNamespace(blocks=[Block("r000c000"), Block("r000c001")], left_out={})
+
+
+@pytest.fixture
+def nested(monkeypatch, tmp_path):
+    """The command lines that would be run; each publishes what it was asked to."""
+    asked = []
+
+    def run(command, check):
+        asked.append(command)
+        store.write_json(tmp_path / "town/run.json", {"failed_blocks": store.read_json(tmp_path / "town/failed.json")})
+
+    monkeypatch.setattr(subprocess, "run", run)
+    return asked
+
+
+def lost(reason="no luck", block="r000c001", step="sections") -> Failure:
+    return Failure("town", block, step, "x.log", reason)
+
+
+def test_one_block_lost(nested, tmp_path):
+    argv = ["--cores", "2", "--config", "scene=town"]
+    assert failures.publish_rest([lost()], {"town": TOWN}, argv, {"scene": "town"}, tmp_path)
+    assert nested[0][3:] == [*argv, "--nolock", "--config", "scene=town", "leave_out=town/r000c001/sections"]
+    told = failures.told([lost()], True, {"town": TOWN}, tmp_path).split("\n")
+    assert told[0] == "error: town r000c001, sections: no luck (log: x.log)"
+    assert told[1].startswith("1 of 2 blocks failed; the rest of the city is published")
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        [Failure("town", "", "scene", "x.log", "bad raster")],
+        [lost(), Failure("town", "", "stitch", "x.log", "boom")],
+        [lost(f"x.parquet is damaged: {errors.AGAIN} and it is made again")],
+        [lost(), lost(f"no space left: free some of the disk, then {errors.AGAIN}", "r000c000")],
+        [lost(), lost(block="r000c000")],
+    ],
+    ids=["no block", "another job too", "damage", "a full disk", "every block"],
+)
+def test_nothing_to_publish(nested, tmp_path, found):
+    assert not failures.publish_rest(found, {"town": TOWN}, [], {}, tmp_path)
+    assert nested == []
+    assert "is published" not in failures.told(found, False, {"town": TOWN}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("log", "reason"),
+    [
+        ("warning: x\nerror: first\nerror: last one\n", "last one"),
+        ("Traceback (most recent call last):\n  File x\nValueError: odd\n", "ValueError: odd"),
+        ("", "it was killed (out of memory, a time limit?)"),
+    ],
+)
+def test_reasons(tmp_path, log, reason):
+    (tmp_path / "a.log").write_text(log)
+    assert failures.reason(tmp_path / "a.log") == reason
+    assert failures.reason(tmp_path / "none.log") == "it was killed (out of memory, a time limit?)"
+
+
+@pytest.mark.parametrize(
+    ("error", "last", "traced"),
+    [
+        (errors.KibsError("say so"), "error: say so", False),
+        (MemoryError(), "error: there is not enough memory", False),
+        (ValueError("odd"), "error: ValueError (odd): a mistake in KIBS", True),
+    ],
+)
+def test_the_last_line_is_ours(capsys, error, last, traced):
+    def main():
+        raise error
+
+    with pytest.raises(SystemExit) as end:
+        cli.run(main)
+    said = capsys.readouterr().err
+    assert end.value.code == 1
+    assert said.strip().split("\n")[-1].startswith(last)
+    assert ("Traceback" in said) == traced
+
+
+def test_a_disk_that_is_full(tmp_path, monkeypatch):
+    """Also when the library that writes does not notice; what was there stays."""
+    store.write_json(tmp_path / "a.json", 1)
+    monkeypatch.setattr(store.shutil, "disk_usage", lambda _: SimpleNamespace(free=10))
+    with pytest.raises(store.DiskFull, match=r"no space left for .*a\.json: free some of the disk"):
+        store.write_json(tmp_path / "a.json", 2)
+    monkeypatch.undo()
+    assert store.read_json(tmp_path / "a.json") == 1
+    assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["a.json"]
+
+
+def test_verify_leaves_a_users_files_alone(tmp_path):
+    folder = tmp_path / "town"
+    store.write_json(folder / "city.gpkg", {"old": 1})
+    store.write_json(folder / "blocks/r0/planes.parquet", 1)
+    (folder / "my project.qgz").write_text("mine")
+    (folder / "city.gpkg").write_text("edited")
+    (folder / "blocks/r0/stray.parquet").write_text("from nowhere")
+    found, read = verify.findings(folder)
+    assert read == 2
+    verify.mend(found, folder)
+    assert (folder / "my project.qgz").read_text() == "mine"
+    assert (folder / "city.gpkg.changed").read_text() == "edited"
+    assert not (folder / "city.gpkg").exists()
+    assert [p.name for p in (folder / "blocks/r0").iterdir() if p.is_file()] == ["planes.parquet"]
+    assert Path(folder, "city.gpkg.changed") not in {f.path for f in verify.findings(folder)[0]}

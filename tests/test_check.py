@@ -1,0 +1,43 @@
+"""`snakemake check` tells grid, models, time, disk and doubts, and writes nothing."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parent / "faults"))
+import cases
+
+from kibs_steps import check, plan
+
+SCHEMA = yaml.safe_load((Path(__file__).parents[1] / "workflow/schemas/config.schema.yaml").read_text())
+STEPS = ("tiles", "sections", "corners", "planes", "ground", "solids")
+
+
+def test_a_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = {**cases.good(tmp_path), "dtm": 30}
+    ((name, values),) = plan.scenes(config, SCHEMA).items()
+    planned = plan.plan(name, values, tmp_path, tmp_path / "results")
+    before = {p for p in tmp_path.rglob("*") if "fingerprints" not in p.name}
+    text = check.page(planned, tmp_path / "results", dict.fromkeys(STEPS, len(planned.blocks)))
+    assert {p for p in tmp_path.rglob("*") if "fingerprints" not in p.name} == before
+    for told in ("110 x 90 px of 0.38 m in EPSG:32631", "6 tiles in 2 blocks", "licence CC0-1.0", "5.9 m from where it stands",
+                 "sections 2", "one core", "results/s", "level at 30 m", "no truth is given"):  # fmt: skip
+        assert told in text, told
+    done = check.page(planned, tmp_path / "results", dict.fromkeys(STEPS, 0))
+    assert "nothing: all blocks are made" in done
+
+
+def test_estimates_grow_with_what_is_to_do():
+    tiles = {"sections": 0.1, "corners": 0.1}
+    whole = check.estimate(10_000_000, 400, dict.fromkeys(STEPS, 1.0), 60, tiles)
+    half = check.estimate(10_000_000, 400, dict.fromkeys(STEPS, 0.5), 30, tiles)
+    none = check.estimate(10_000_000, 400, dict.fromkeys(STEPS, 0.0), 0, tiles)
+    assert none == (0.0, 0.0)
+    assert whole.seconds > half.seconds > 80
+    assert check.duration(12.0) == "20 s"
+    assert check.duration(1234.0) == "21 min"
+    assert check.duration(40_000.0) == "11.1 h"
