@@ -30,6 +30,10 @@ MISPLACED = 0.15  # m of height that an edge beside its place makes two planes d
 PARALLEL = 0.15  # m/m, planes whose gradients differ less are parallel
 COINCIDE = 0.3  # m, parallel planes this near are one level
 TOUCH = 0.1  # m, planes this near at a single vertex are made to meet there
+LEAST, MOST = (
+    0.1,
+    0.19,
+)  # m, how far a fitted plane is lifted: a roof face within 0.2 m of its section's plane is faithful
 FLAT_WEIGHT = 1e-4  # of a section whose plane is only a placeholder, per m²
 
 
@@ -42,8 +46,8 @@ class Together(NamedTuple):
 
 
 def tolerance(sigma: np.ndarray, reliable: np.ndarray) -> np.ndarray:
-    """How far (m) each plane may be lifted at any vertex: three times its σ within 0.25–1 m; placeholders 3 m."""
-    return np.where(reliable, np.clip(3 * sigma, 0.25, 1.0), 3.0)
+    """How far (m) each plane may be lifted at any vertex: three times its σ, `LEAST` to `MOST`; placeholders 3 m."""
+    return np.where(reliable, np.clip(3 * sigma, LEAST, MOST), 3.0)
 
 
 def bring_together(

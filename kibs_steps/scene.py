@@ -45,10 +45,6 @@ class VerticalCrsUnusable(KibsError):
     """A vertical CRS that is none."""
 
 
-class RegionsUnusable(KibsError):
-    """A layer of regions that does not say from where each was seen."""
-
-
 class Direction(NamedTuple):
     """A direction to the satellite or the sun: azimuth and elevation (deg), and its lean (m/m, grid axes east, north)."""
 
@@ -298,38 +294,6 @@ def direction(
     return Direction(float(azimuth) % 360.0, float(elevation), lean)
 
 
-def read_regions(path: str | Path, grid: Grid) -> tuple[Region, ...]:
-    """The regions of a polygon layer with the columns `view_azimuth` and `view_elevation` (deg), in the layer's order.
-
-    Where polygons overlap the later one holds. Raises `RegionsUnusable`, `AnglesUnusable`.
-    """
-    import geopandas
-    import pyogrio
-    import shapely
-
-    try:
-        frame = geopandas.read_file(path)
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
-        raise RegionsUnusable(
-            f"regions {path} cannot be read as vector data ({error}): give a GeoPackage or GeoJSON"
-        ) from error
-    lacking = [name for name in ("view_azimuth", "view_elevation") if name not in frame.columns]
-    if lacking:
-        raise RegionsUnusable(
-            f"regions {path} lacks the column {' and '.join(lacking)}: each polygon needs both, in degrees"
-        )
-    if frame.crs is None:
-        raise RegionsUnusable(f"regions {path} has no CRS: assign it, or save it as GeoJSON in WGS 84")
-    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].to_crs(grid.crs)
-    if frame.empty:
-        raise RegionsUnusable(f"regions {path} holds no polygon: draw the parts of the image that share a view")
-    if frame[["view_azimuth", "view_elevation"]].isna().any(axis=None):
-        raise RegionsUnusable(f"regions {path}: a polygon has no view_azimuth or view_elevation: fill in both")
-    outlines = shapely.make_valid(shapely.force_2d(frame.geometry.to_numpy()))
-    angles = zip(frame["view_azimuth"].astype(float), frame["view_elevation"].astype(float), strict=True)
-    return tuple(Region(o, direction(*a, grid, "view")) for o, a in zip(outlines, angles, strict=True))
-
-
 def convergence(grid: Grid) -> float:
     """Meridian convergence (deg) at the grid's centre: the angle from true to grid north, clockwise."""
     import pyproj
@@ -409,13 +373,14 @@ def build(
 
     from kibs_steps import dtm as terrain_model
     from kibs_steps import imagery
+    from kibs_steps import regions as region_layer
 
     grid = model_grid(raster, gsd, aoi)
     directions = {
         "view": direction(*view, grid, "view"),
         "sun": direction(*sun, grid, "sun", lowest=5.0),
     }
-    parts = read_regions(regions, grid) if regions else ()
+    parts = region_layer.read(regions, grid) if regions else ()
     check_vertical(vertical_crs)
     if projection_height is not None and not abs(projection_height) <= terrain_model.HIGHEST:
         raise terrain_model.DtmAbsurd(f"projection_height={projection_height} is no height on Earth: give metres")

@@ -75,6 +75,11 @@ def height(plane: np.ndarray, point: Point) -> int:
     return round(float(plane[0] * point[0] + plane[1] * point[1] + plane[2] * MM))
 
 
+def lowest(face: Face, plane: np.ndarray) -> int:
+    """Lowest height (mm) of a face under its plane."""
+    return min(height(plane, p) for ring in face.rings for p in ring)
+
+
 def column_heights(faces: Sequence[Face], planes: np.ndarray) -> dict[Point, dict[int, int]]:
     """Height (mm) of each face at each of its vertices; heights within `SAME` of each other at one vertex are made one."""
     found: dict[Point, list[tuple[int, int]]] = defaultdict(list)

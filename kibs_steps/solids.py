@@ -213,15 +213,10 @@ def _first(
 
 def _clipped(faces: list[Face], planes: np.ndarray, ground: int) -> list[Face]:
     """Faces cut where they come down to the ground. Raises `Refused` if none does."""
-    low = {f.section for f in faces if _lowest(f, planes[f.section]) - ground < LOWEST_ROOF * MM}
+    low = {f.section for f in faces if shells.lowest(f, planes[f.section]) - ground < LOWEST_ROOF * MM}
     if not low:
         raise Refused("no section comes down to the ground")
     return straight.tidied(clip.clipped(faces, planes, low, ground + round(LOWEST_ROOF * MM)))
-
-
-def _lowest(face: Face, plane: np.ndarray) -> int:
-    """Lowest height (mm) of a face."""
-    return min(shells.height(plane, p) for ring in face.rings for p in ring)
 
 
 def _unusable(face: Face, plane: np.ndarray, ground: int) -> str | None:
@@ -229,7 +224,7 @@ def _unusable(face: Face, plane: np.ndarray, ground: int) -> str | None:
     slope = float(np.degrees(np.arctan(np.hypot(plane[0], plane[1]))))
     if slope > SLOPE_CAP:
         return f"has a slope of {slope:.0f}°"
-    above = _lowest(face, plane) - ground
+    above = shells.lowest(face, plane) - ground
     if above < LOWEST_ROOF * MM:
         return f"comes down to {above / MM:.2f} m above the ground"
     return None

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, dtm, imagery, scene, store, view
+from kibs_steps import cli, dtm, imagery, scene, view
 from kibs_steps.corners import CORNERS
 from kibs_steps.planes import map_bounds, middle_of
 from kibs_steps.terrain import Terrain
@@ -102,8 +102,7 @@ def main(argv: list[str] | None = None) -> None:
     facts = scene.read(args.scene)
     with imagery.opened(facts.raster) as source:
         footprint = imagery.outline(source, pyproj.CRS.from_user_input(facts.grid.crs))
-    with store.whole(args.out) as temporary:
-        dtm.write(args.dsm, facts.grid, footprint, temporary)
+    dtm.write(args.dsm, facts.grid, footprint, args.out)
 
 
 if __name__ == "__main__":

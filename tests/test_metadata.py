@@ -11,7 +11,7 @@ import rasters
 import shapely
 from rasterio.rpc import RPC
 
-from kibs_steps import metadata, plan, scene
+from kibs_steps import metadata, plan, regions, scene
 from kibs_steps.metadata import Angles, MetadataUnusable
 
 IMD = """version = "28.4";
@@ -235,5 +235,5 @@ def test_regions_without_angles_are_refused(tmp_path):
     raster = rasters.write(tmp_path / "mosaic.tif", rasters.picture(), gsd=0.5)
     frame = geopandas.GeoDataFrame(geometry=[shapely.box(0, 0, 1, 1)], crs="EPSG:32631")
     frame.to_file(tmp_path / "bare.gpkg")
-    with pytest.raises(scene.RegionsUnusable, match="lacks the column view_azimuth and view_elevation"):
+    with pytest.raises(regions.RegionsUnusable, match="lacks the column view_azimuth and view_elevation"):
         scene.build("m", raster, 0.0, 0.5, tmp_path, regions=tmp_path / "bare.gpkg")

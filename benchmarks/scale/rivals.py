@@ -9,6 +9,7 @@ and the power law through them says what a city would take.
 from __future__ import annotations
 
 import multiprocessing
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -63,9 +64,17 @@ def per_tile(paths: list[Path], tiles: int, cores: int) -> float:
 
 
 def pair(folder: Path) -> list[Path]:
-    """The paper's two networks with random weights as ONNX files, exported where they are missing."""
+    """The paper's two networks with random weights as ONNX files, exported where they are missing.
+
+    Exporting needs torchvision, or its operators in plain torch (`tests/torchvision_cpu_ops.py`); the files need neither. Raises
+    `maskrcnn.NoTorchvision`.
+    """
     import torch
 
+    sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+    import torchvision_cpu_ops
+
+    torchvision_cpu_ops.usable()
     from kibs_steps.learn import maskrcnn
 
     paths = []
@@ -121,6 +130,7 @@ def law(sizes: list[float], seconds: list[float]) -> tuple[float, float]:
 
 def growth(labels: Callable[[int], np.ndarray], sides: list[int]) -> dict[str, Any]:
     """Seconds of `flooded` on label images (side, side) of the given sides, and the law through them (size in Mpx)."""
+    flooded(np.ones((2, 2), bool))  # imports what it needs
     sizes, seconds = [], []
     for side in sides:
         roofs = labels(side) > 0

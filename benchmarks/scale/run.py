@@ -31,6 +31,8 @@ import rasters
 import rivals
 import watch
 
+from kibs_steps.errors import KibsError
+
 ROOT = Path(__file__).parents[2]
 SIZES = {
     "1": (1000, 1000),
@@ -267,7 +269,7 @@ def paper_models(out: Path, tiles: int, cores: int) -> dict[str, Any]:
     """Seconds per tile of the paper's pair, or why it cannot be measured here."""
     try:
         paths = rivals.pair(out / "pair")
-    except (ImportError, RuntimeError, AttributeError) as error:
+    except (ImportError, KibsError) as error:
         return {"reason": str(error)}
     with rasterio.open(sorted(out.glob("raster*/raster.tif"))[0]) as source:
         image = source.read(window=((0, 700), (0, 700))).astype(np.float32)

@@ -319,6 +319,7 @@ def main(argv: list[str] | None = None) -> None:
     sources.add_arguments(parser)
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
+    cv2.setNumThreads(1)  # the loader's processes are forked: they would wait for threads that only their parent has
     out = Path(args.out)
     if args.family == "maskrcnn":
         task = args.task or "sections"

@@ -11,7 +11,6 @@ count from the ellipsoid.
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 from collections import OrderedDict, defaultdict
 from collections.abc import Iterable
@@ -138,7 +137,8 @@ def write(folder: Path, found: Iterable[Mesh], earth: Earth, asset: dict[str, An
     for place in sorted(squares):
         glb, extent = content(squares[place], earth)
         name = f"{place[0]}_{place[1]}.glb"
-        (folder / name).write_bytes(glb)
+        with store.whole(folder / name) as temporary:
+            temporary.write_bytes(glb)
         children.append({"boundingVolume": box(extent), "geometricError": 0.0, "content": {"uri": name}})
         bounds.append(extent)
     whole = np.stack([np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]]) if bounds else np.zeros((2, 3))
@@ -147,7 +147,7 @@ def write(folder: Path, found: Iterable[Mesh], earth: Earth, asset: dict[str, An
     if children:
         root["children"] = children
     tileset = {"asset": {"version": "1.1", **asset}, "geometricError": 2 * error, "root": root}
-    (folder / "tileset.json").write_text(json.dumps(tileset, indent=1) + "\n", encoding="utf-8")
+    store.write_json(folder / "tileset.json", tileset)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -85,15 +85,20 @@ def read(path: str | Path) -> CityModel:
 
 
 def _horizontal(system: str | None) -> str | None:
-    """The projected part of a reference system, "EPSG:n"; None where none is stated."""
+    """The horizontal part of a reference system, "EPSG:n"; None where none is stated. Raises `UnusableCity` for degrees."""
     code = re.search(r"(\d+)$", system or "")
     if not code:
         return None
     import pyproj
 
-    crs = pyproj.CRS.from_epsg(int(code[1]))
+    try:
+        crs = pyproj.CRS.from_epsg(int(code[1]))
+    except pyproj.exceptions.CRSError as error:
+        raise UnusableCity(f"the city's reference system {system} is not known: state one of EPSG's") from error
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
-    return f"EPSG:{flat.to_epsg()}"
+    if flat.is_geographic:
+        raise UnusableCity(f"the city's coordinates are degrees ({system}): reproject it to a system in metres")
+    return f"EPSG:{flat.to_epsg() or code[1]}"
 
 
 def _vertices(stored: list, transform: dict[str, Any] | None) -> np.ndarray:

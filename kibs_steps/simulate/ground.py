@@ -39,7 +39,9 @@ def between(site: Site, plots: np.ndarray, first: Callable[[], None] | None = No
     elif rng.random() < 0.7:
         reach = float(np.hypot(a[2] - a[0], a[3] - a[1])) / 2
         for s in np.arange(-reach, reach, 90.0):
-            FILL["park"](site, s, -reach, s + 90.0, reach)
+            for t in np.arange(-reach, reach, 70.0):
+                if site.inside(*site.at(s + 45.0, t + 35.0), 50.0):
+                    FILL["park"](site, s, t, s + 90.0, t + 70.0)
     if streets:
         # Streets are what is neither near a building nor in an open place.
         _fill(site, distance < road, site.road, 0.05)

@@ -240,7 +240,7 @@ def test_gltf_validator_finds_no_error(town, tmp_path):
     glb.main([*arguments, "--drape", "--out", str(tmp_path / "draped.glb")])
     tiles3d.main([*arguments, "--out", str(tmp_path / "tiles3d/tileset.json")])
     (tmp_path / "empty.glb").write_bytes(glb.empty({"title": "none"}))
-    files = [str(f) for f in tmp_path.rglob("*.glb")]
+    files = [str(f) for f in tmp_path.rglob("*.glb") if f.parent.name != ".sums"]
     script = """const v = require(process.argv[1]), fs = require("fs");
     (async () => { for (const f of process.argv.slice(2)) {
       const report = await v.validateBytes(new Uint8Array(fs.readFileSync(f)));

@@ -94,6 +94,8 @@ def test_a_bent_surface_becomes_planar_ones():
         ('{"type": "FeatureCollection"}', "not CityJSON"),
         (json.dumps(cities.document([HOUSE], lod=1.2)), "LOD2"),
         (json.dumps(cities.document([])), "LOD2"),
+        (json.dumps(cities.document([HOUSE], crs=4979)), "degrees"),
+        (json.dumps(cities.document([HOUSE], crs=999999)), "not known"),
     ],
 )
 def test_other_files_are_refused_by_name(tmp_path, text, say):

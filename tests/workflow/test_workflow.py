@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pyogrio
 import pytest
+import rasterio
 import toy
 
 ROOT = Path(__file__).parents[2]
@@ -222,3 +223,29 @@ def test_run_json_tells_models_and_counts(town):
     text = json.dumps(record)
     assert "CC0-1.0" in text
     assert hashlib.sha256((town / "models/sections.onnx").read_bytes()).hexdigest() in text
+
+
+def test_edited_sections_rerun_from_the_planes(copy):
+    """One section deleted by hand: the others keep their ids, and nothing is detected again."""
+    layer = pyogrio.read_dataframe(copy / "results/town/city.gpkg", layer="roof_sections_image")
+    layer.iloc[1:].to_file(copy / "edited.gpkg", layer="roof_sections_image")
+    done = jobs(run(copy, sections="edited.gpkg"))
+    assert {"edited", "planes", "ground", "buildings", "solids", "geopackage"} <= set(done)
+    assert not {"scene", "tiles", "sections", "blend", "corners", "stitch"} & set(done)
+    found = pyogrio.read_dataframe(copy / "results/town/city.gpkg", layer="roof_sections")
+    assert sorted(found["section_id"]) == sorted(layer["section_id"].iloc[1:])
+
+
+def test_heights_of_a_surface_model_need_no_corner_model(tmp_path):
+    """Flat roofs of 12.5 m on ground at 100 m: the DSM says so, and so do the buildings."""
+    folder = world(tmp_path / "dsm")
+    with rasterio.open(folder / "town.tif") as source:
+        shape, transform, crs = (source.height, source.width), source.transform, source.crs
+    profile = {"driver": "GTiff", "count": 1, "dtype": "float32", "crs": crs, "transform": transform}
+    with rasterio.open(folder / "dsm.tif", "w", height=shape[0], width=shape[1], **profile) as target:
+        target.write(np.full((1, *shape), 112.5, np.float32))
+    output = run(folder, dsm="dsm.tif")
+    assert not {"blend", "corners"} & set(jobs(output))
+    found = pyogrio.read_dataframe(folder / "results/town/city.gpkg", layer="roof_sections")
+    assert len(found) > 3
+    assert np.abs(found["height_mean"] - 12.5).max() < 0.05

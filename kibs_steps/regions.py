@@ -1,0 +1,48 @@
+"""Regions: parts of one raster that were seen from different directions, as the patches of an aerial mosaic.
+
+In: a polygon layer with `view_azimuth` and `view_elevation` (deg) of each part. Out: `scene.Region`s, for `scene.json`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kibs_steps.errors import KibsError
+from kibs_steps.grid import Grid
+from kibs_steps.scene import Region, direction
+
+
+class RegionsUnusable(KibsError):
+    """A layer of regions that does not say from where each was seen."""
+
+
+def read(path: str | Path, grid: Grid) -> tuple[Region, ...]:
+    """The regions of a polygon layer with the columns `view_azimuth` and `view_elevation` (deg), in the layer's order.
+
+    Where polygons overlap the later one holds. Raises `RegionsUnusable`, `AnglesUnusable`.
+    """
+    import geopandas
+    import pyogrio
+    import shapely
+
+    try:
+        frame = geopandas.read_file(path)
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise RegionsUnusable(
+            f"regions {path} cannot be read as vector data ({error}): give a GeoPackage or GeoJSON"
+        ) from error
+    lacking = [name for name in ("view_azimuth", "view_elevation") if name not in frame.columns]
+    if lacking:
+        raise RegionsUnusable(
+            f"regions {path} lacks the column {' and '.join(lacking)}: each polygon needs both, in degrees"
+        )
+    if frame.crs is None:
+        raise RegionsUnusable(f"regions {path} has no CRS: assign it, or save it as GeoJSON in WGS 84")
+    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].to_crs(grid.crs)
+    if frame.empty:
+        raise RegionsUnusable(f"regions {path} holds no polygon: draw the parts of the image that share a view")
+    if frame[["view_azimuth", "view_elevation"]].isna().any(axis=None):
+        raise RegionsUnusable(f"regions {path}: a polygon has no view_azimuth or view_elevation: fill in both")
+    outlines = shapely.make_valid(shapely.force_2d(frame.geometry.to_numpy()))
+    angles = zip(frame["view_azimuth"].astype(float), frame["view_elevation"].astype(float), strict=True)
+    return tuple(Region(o, direction(*a, grid, "view")) for o, a in zip(outlines, angles, strict=True))
