@@ -24,7 +24,7 @@ from kibs_steps import plan as plans
 from kibs_steps.models import runtime
 from kibs_steps.plan import Plan
 
-# Seconds on one core per Mpx beside the networks, and per job; bytes on disk per pixel. Planes, ground and buildings were timed on
+# Seconds on one core per Mpx beside the networks, and per job; bytes on disk per pixel. Planes and ground were timed on
 # the demo (1.44 Mpx of town), the others set so that the demo's whole time comes out: good for "minutes or hours", no more.
 SECONDS = {"tiles": 0.5, "sections": 2.0, "blend": 0.5, "corners": 0.5, "planes": 0.5, "ground": 0.3, "solids": 20.0}
 OTHER_SECONDS = 10.0  # stitch, buildings and the published files
