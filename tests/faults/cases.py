@@ -375,7 +375,7 @@ def _(folder):
 
 
 @case("models", "no model there", "NotAModel",
-      "no model at nowhere/sections.onnx: give `models=` a folder with sections.onnx and corners.onnx")  # fmt: skip
+      "no model at nowhere: give `models=` a folder with sections.onnx and corners.onnx")  # fmt: skip
 def _(folder):
     return {"models": "nowhere"}
 
