@@ -190,8 +190,8 @@ def main(argv: list[str] | None = None) -> None:
     found = summary(rows)
     report = text(found, rows, (args.old.name, args.new.name))
     plain = [{k: v for k, v in row.items() if k != "geometry"} for row in rows]
-    store.write_json(args.out / "changes.json", {**found, "buildings": plain})
-    with store.whole(args.out / "changes.txt") as temporary:
+    store.write_json(args.out / "changes.json", {**found, "buildings": plain}, summed=False)
+    with store.whole(args.out / "changes.txt", summed=False) as temporary:
         temporary.write_text(report, encoding="utf-8")
     _write_layer(args.out / "changes.gpkg", rows, crs)
     print(report, end="")
@@ -209,7 +209,7 @@ def _write_layer(path: Path, rows: list[dict[str, Any]], crs: str) -> None:
     for name in ("building_old", "building_new"):
         if name in frame:
             frame[name] = frame[name].astype("Int64")
-    with store.whole(path) as temporary:
+    with store.whole(path, summed=False) as temporary:
         temporary.unlink()
         frame.to_file(temporary, layer="changes", driver="GPKG")
 

@@ -36,10 +36,11 @@ class DiskFull(KibsError):
 
 
 @contextlib.contextmanager
-def whole(path: str | Path) -> Iterator[Path]:
+def whole(path: str | Path, summed: bool = True) -> Iterator[Path]:
     """Yield a temporary path with `path`'s suffixes beside it; rename it to `path` when the block ends without error.
 
-    Raises `DiskFull` where the disk has no room for it, also when the library that wrote it did not notice.
+    `summed`: with checksums (`sums`), as files of a scene are; not what people edit, move and replace themselves. Raises
+    `DiskFull` where the disk has no room for it, also when the library that wrote it did not notice.
     """
     path = Path(path)
     try:
@@ -54,7 +55,8 @@ def whole(path: str | Path) -> Iterator[Path]:
         yield temporary
         if shutil.disk_usage(path.parent).free < FULL:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        sums.write(path, sums.of_file(temporary))
+        if summed:
+            sums.write(path, sums.of_file(temporary))
         os.replace(temporary, path)
     except Exception as error:
         raise _told(error, path) from error
@@ -71,9 +73,9 @@ def _told(error: Exception, path: Path) -> Exception:
     return error
 
 
-def write_json(path: str | Path, content: Any) -> None:
-    """Write JSON with two-space indent, keys in the order given."""
-    with whole(path) as temporary:
+def write_json(path: str | Path, content: Any, summed: bool = True) -> None:
+    """Write JSON with two-space indent, keys in the order given; `summed` as in `whole`."""
+    with whole(path, summed) as temporary:
         temporary.write_text(
             json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
         )

@@ -100,7 +100,9 @@ def discard(path: str | Path) -> None:
 
 
 def damaged(path: str | Path, what: object) -> DamagedFile:
-    """The error for a damaged file, which is deleted so that the next run makes it again."""
+    """The error for a damaged file; one that a step wrote is deleted, so that the next run makes it again."""
+    if not place(path).exists():
+        return DamagedFile(f"{path} is damaged ({what}): correct it, or delete it if a run makes it")
     discard(path)
     return DamagedFile(f"{path} is damaged ({what}): it is deleted now, {AGAIN} and it is made again")
 

@@ -49,9 +49,22 @@ class TestJson:
 
     @pytest.mark.parametrize("content", [b"", b'{"a": 1', b"\xff\xfe\x00"])
     def test_damage(self, tmp_path, content):
+        store.write_json(tmp_path / "a.json", {"a": 1})
         (tmp_path / "a.json").write_bytes(content)
         with pytest.raises(store.DamagedFile, match="is deleted now"):
             store.read_json(tmp_path / "a.json")
+        assert not (tmp_path / "a.json").exists()
+
+    def test_what_no_step_wrote_is_never_deleted(self, tmp_path):
+        (tmp_path / "mine.json").write_text('{"a": 1')
+        with pytest.raises(store.DamagedFile, match="correct it"):
+            store.read_json(tmp_path / "mine.json")
+        assert (tmp_path / "mine.json").exists()
+
+    def test_files_for_people_have_no_sums(self, tmp_path):
+        store.write_json(tmp_path / "mine.json", {"a": 1}, summed=False)
+        (tmp_path / "mine.json").write_text('{"a": 2}')
+        assert store.read_json(tmp_path / "mine.json") == {"a": 2}
 
 
 class TestTables:

@@ -61,7 +61,7 @@ def draw(path: str | Path, found: dict[str, Curve]) -> None:
         across = x + 2 + (steps - steps[0]) / max(steps[-1] - steps[0], 1) * (PANEL[0] - 4)
         down = bottom - 3 - (values - low) / max(high - low, 1e-12) * (PANEL[1] - 24)
         pen.line(list(zip(across.tolist(), down.tolist(), strict=True)), LINE, 2)
-    with store.whole(path) as temporary:
+    with store.whole(path, summed=False) as temporary:
         page.save(temporary, "PNG")
 
 
@@ -114,7 +114,7 @@ def main(argv: list[str] | None = None) -> None:
         found |= {prefix + name: curve for name, curve in curves(path.parent / "log").items()}
     draw(args.curves, {name: curve for name, curve in found.items() if not name.endswith("rate")})
     models = [contracts.load(path) for path in args.models]
-    with store.whole(args.card) as temporary:
+    with store.whole(args.card, summed=False) as temporary:
         temporary.write_text(
             text(Path(args.card).parent.name, models, [store.read_json(p) for p in args.runs]), encoding="utf-8"
         )

@@ -131,12 +131,12 @@ def write(folder: str | Path, samples: Iterable[tuple[str, Sample]], bins: Bins,
 
     def pictured() -> Iterator[tuple[str, Sample]]:
         for name, sample in samples:
-            with store.whole(folder / "images" / f"{name}.png") as temporary:
+            with store.whole(folder / "images" / f"{name}.png", summed=False) as temporary:
                 cv2.imwrite(str(temporary), sample.rgb[..., ::-1])
             yield name, sample
 
     for kind, content in zip(("sections", "corners"), annotations(pictured(), bins, side), strict=True):
-        store.write_json(folder / f"{kind}.json", content)
+        store.write_json(folder / f"{kind}.json", content, summed=False)
 
 
 def read(folder: str | Path, images: str | Path | None = None) -> Iterator[tuple[str, Sample]]:

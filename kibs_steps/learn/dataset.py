@@ -423,7 +423,7 @@ def save(path: str | Path, sample: Sample) -> None:
     """Keep a sample in one compressed file."""
     from kibs_steps import store
 
-    with store.whole(path) as temporary, temporary.open("wb") as file:
+    with store.whole(path, summed=False) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **sample._asdict())
 
 

@@ -96,7 +96,7 @@ def export(model: nn.Module, path: str | Path, contract: dict[str, Any]) -> None
 
     tile = contract["tile"]
     model = model.eval().to(memory_format=torch.contiguous_format)
-    with store.whole(path) as temporary:
+    with store.whole(path, summed=False) as temporary:
         if contract["head"] == "instances":
             maskrcnn.to_onnx(model, str(temporary), tile)
         else:
@@ -151,7 +151,7 @@ def main(argv: list[str] | None = None) -> None:
     export(model, args.out, contract_of(task, heights, settings.family, **facts))
     if args.weights:
         halves = {k: v.half() if v.is_floating_point() else v for k, v in average.items()}
-        with store.whole(args.weights) as temporary:
+        with store.whole(args.weights, summed=False) as temporary:
             torch.save({"average": halves, "settings": state["settings"]}, temporary)
     print(f"{args.out}: {state['step']} steps, {state['seconds'] / 60:.0f} min")
 

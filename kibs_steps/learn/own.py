@@ -179,7 +179,7 @@ def write_truth(path: Path, sections: Truth, scene: Scene, split: NDArray[np.int
     frame = geopandas.GeoDataFrame(
         {"section_id": sections.ids, "split": split}, geometry=list(sections.standing), crs=scene.grid.crs
     )
-    with store.whole(path) as temporary:
+    with store.whole(path, summed=False) as temporary:
         temporary.unlink()
         pyogrio.write_dataframe(frame, temporary, layer="sections_map", driver="GPKG", geometry_type="Polygon Z")
 
@@ -266,7 +266,7 @@ def main(argv: list[str] | None = None) -> None:
             "sigma": float(known.std()) if len(known) else None,
         },
     }
-    store.write_json(args.out / "own.json", record)
+    store.write_json(args.out / "own.json", record, summed=False)
     print(f"{args.out}: {', '.join(f'{n} {name}' for name, n in counts.items())} tiles")
 
 

@@ -257,7 +257,7 @@ def train(
             "about": about or {},
             "converged": best.since >= patience if judged else None,
         }
-        with store.whole(path) as temporary:
+        with store.whole(path, summed=False) as temporary:
             torch.save(content, temporary)
 
     saved, now = used, time.monotonic()
@@ -352,7 +352,7 @@ def main(argv: list[str] | None = None) -> None:
         patience=args.patience,
         about=found.about,
     )
-    store.write_json(out / "done.json", {"settings": settings._asdict(), "steps": steps, **found.about})
+    store.write_json(out / "done.json", {"settings": settings._asdict(), "steps": steps, **found.about}, summed=False)
     print(f"{out / 'checkpoint.pt'}: {steps} steps")
 
 

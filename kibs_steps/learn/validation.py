@@ -177,12 +177,15 @@ def judge_sections(
 def best_thresholds(
     raw: Sequence[dict[str, np.ndarray]], samples: Sequence[dataset.Sample], contract: dict[str, Any]
 ) -> dict[str, float]:
-    """The pair of `roof` and `prominence` thresholds with the best AP at overlap 0.5 over the samples, by trying a grid."""
+    """The pair of `roof` and `prominence` thresholds with the best sum of roof IoU and AP at overlap 0.5, by trying a grid."""
 
     def score(roof: float, prominence: float) -> float:
         tried = {**contract, "thresholds": {**contract["thresholds"], "roof": roof, "prominence": prominence}}
         found = [heads.decode_sections(maps, tried) for maps in raw]
-        return average_precision(matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True))
+        overlap = roof_iou((m["roof"][0] > roof, s.roof) for m, s in zip(raw, samples, strict=True))
+        return overlap + average_precision(
+            matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True)
+        )
 
     grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)]
     roof, prominence = max(grid, key=lambda pair: score(*pair))
@@ -300,10 +303,10 @@ def main(argv: list[str] | None = None) -> None:
             report[name]["corners_true_sections"] = judge_corners(corner_model, samples, [s.labels for s in samples])
         if args.pictures:
             sheet = np.vstack([picture(s, r, f) for s, r, f in list(zip(samples, raw, found, strict=True))[:6]])
-            with store.whole(Path(args.pictures) / f"{name}.png") as temporary:
+            with store.whole(Path(args.pictures) / f"{name}.png", summed=False) as temporary:
                 cv2.imwrite(str(temporary), sheet[..., ::-1])
         print(name, {k: round(v, 3) if isinstance(v, float) else v for k, v in report[name].items()}, flush=True)
-    store.write_json(args.out, report)
+    store.write_json(args.out, report, summed=False)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ def sets(folder: Path, tasks: tuple[str, ...]) -> list[Set]:
     Raises what `contract.load` and `contract.agree` raise, and `NotAModel` where there is no set.
     """
     found = []
-    for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir())):
+    for place in (folder, *sorted(p for p in folder.glob("[!.]*") if p.is_dir())):
         for path in sorted(place.glob(f"{tasks[0]}*.onnx")):
             ending = path.name.removeprefix(tasks[0])
             files = {task: place / f"{task}{ending}" for task in tasks}
@@ -42,7 +42,7 @@ def sets(folder: Path, tasks: tuple[str, ...]) -> list[Set]:
 
 
 def _holds_both(folder: Path) -> bool:
-    return any(folder.glob("both*.onnx")) or any(folder.glob("*/both*.onnx"))
+    return any(folder.glob("both*.onnx")) or any(folder.glob("[!.]*/both*.onnx"))
 
 
 def choose(found: list[Set], gsd: float | None, view: dict[str, float] | None, sun: dict[str, float] | None) -> Set:

@@ -66,6 +66,7 @@ class Town(NamedTuple):
             and p.relative_to(self.results).parts[0] not in ("logs", "benchmarks", "run.json", "report.html")
             and ".sums" not in p.parts
             and p.suffix != ".changed"
+            and not p.name.endswith(".aux.xml")  # GDAL's, left by whoever reads a layer
             and not p.name.startswith(".tmp-")
         }
 

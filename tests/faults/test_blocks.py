@@ -47,11 +47,11 @@ def test_the_rest_is_published(undisturbed, fresh, step, fault):
 
 
 def test_a_section_cut_by_a_missing_block_says_so(undisturbed, fresh):
-    fresh.fault(tiles_r000c001="cannot read")
+    fresh.fault(tiles_r000c000="cannot read")
     assert fresh.run().returncode != 0
     sections = pyogrio.read_dataframe(fresh.results / "city.gpkg", layer="roof_sections_image")
-    right = sections.geometry.bounds.maxx
-    cut = sections[right > right.max() - 0.01]
+    blocks = pyogrio.read_dataframe(fresh.results / "city.gpkg", layer="blocks").set_index("block")
+    cut = sections[sections.distance(blocks.geometry["r000c000"]) < 0.01]
     assert set(cut.status) == {"cloud_or_nodata"}
 
 

@@ -162,9 +162,17 @@ def cities(number: int, first: int = 0) -> tuple[int, int]:
         standing = ground.ground(found, FACTS, dtm)
         outlines = shapely.from_wkb(standing["outline_map"].to_numpy(zero_copy_only=False))
         plane = np.stack([standing[k].to_numpy() for k in ("plane_a", "plane_b", "plane_c", "x0", "y0")], axis=1)
-        owner = buildings.buildings(standing["section_id"].to_numpy(), outlines, plane, FACTS.lean, None)
+        owner, cluster = buildings.buildings(standing["section_id"].to_numpy(), outlines, plane, FACTS.lean, None)
         standing = standing.append_column("building_id", pa.array(owner))
-        made = [solids.build(s, dtm) for _, s in solids.sections_of(standing)]
+        standing = standing.append_column("cluster_id", pa.array(cluster))
+        standing = standing.sort_by([("building_id", "ascending"), ("section_id", "ascending")])
+        gap = max(solids.GAP, solids.hidden(np.array([FACTS.lean])))
+        rag = solids.RAGGED * FACTS.grid.gsd
+        made = [
+            one.solid
+            for owners, cluster in solids.clusters_of(standing)
+            for one in solids.together(cluster, owners, dtm, "2.0", gap, rag)
+        ]
         for one in made:
             for shell in one.shells:
                 faces = [surface.rings for surface in shell]
