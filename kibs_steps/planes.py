@@ -30,6 +30,7 @@ SIGMA_FLOOR = 0.02  # m
 TUKEY = 4.0  # residuals beyond 4 σ do not count
 MOST_STARTS = 12  # points whose triples are tried: 220 planes
 MAX_SLOPE = 72.0  # deg, in the map frame
+MIN_HEIGHT = 0.3  # m above ground: lower, and it is no roof
 MAX_HEIGHT = 200.0  # m above ground: taller than any building of a city without high-rises is a mistake
 MIN_AREA = 12.0  # px: smaller areas are specks, not roofs
 TRIANGLE = (0.2, 2.0)  # share of the section's area between which its triangle is trusted (PAPER, planes)
@@ -207,11 +208,18 @@ def fit(
 
 
 def checked(
-    found: Fit, points: Points, area_px: float, ground: float, middle: np.ndarray, edge: bool, void: bool
+    found: Fit,
+    points: Points,
+    area_px: float,
+    ground: float,
+    middle: np.ndarray,
+    edge: bool,
+    void: bool,
 ) -> Fit:
     """The fit with its plausibility: slope, height, size, place in the raster. What comes first in DESIGN's list gives way.
 
-    An implausible slope is replaced by a level plane at the corners' median height; an implausible height keeps its plane.
+    An implausible slope is replaced by a level plane at the corners' median height, an implausible height by one at the nearest
+    plausible height: an absurd one would move the outline along the view to where nothing stands.
     """
     slope = np.degrees(np.arctan(np.hypot(found.plane.a, found.plane.b)))
     if slope > MAX_SLOPE:
@@ -220,8 +228,10 @@ def checked(
             level, found.sigma, "implausible_slope", f"fitted slope {slope:.0f}° exceeds {MAX_SLOPE:.0f}°; made level"
         )
     height = float(found.plane.at(middle)) - ground
-    if not 0.3 <= height <= MAX_HEIGHT:
-        found = found._replace(status="implausible_height", reason=f"mean height {height:.1f} m above ground")
+    if not MIN_HEIGHT <= height <= MAX_HEIGHT:
+        near = float(np.clip(height, MIN_HEIGHT, MAX_HEIGHT))
+        reason = f"mean height {height:.1f} m above ground; made level at {near:g} m"
+        found = Fit(flat(ground + near, middle), found.sigma, "implausible_height", reason)
     if area_px < MIN_AREA:
         found = found._replace(status="too_small", reason=f"{area_px:.0f} px is too small to be trusted")
     if void:

@@ -171,6 +171,15 @@ def test_statuses(change, status):
     assert bool(result.reason) == (status != "ok")
 
 
+@pytest.mark.parametrize(("height", "near"), [(-1086.0, 0.3), (0.2, 0.3), (900.0, planes.MAX_HEIGHT)])
+def test_implausible_height_is_made_level_at_the_nearest_plausible_one(height, near):
+    absurd = planes.Fit(view.Plane(0.5, 0.0, height, *MIDDLE), 0.1, "ok", "")
+    result = planes.checked(absurd, on_plane(SQUARE), 400.0, 0.0, MIDDLE, False, False)
+    assert result.status == "implausible_height"
+    assert (result.plane.a, result.plane.b) == (0, 0)
+    assert result.plane.at(MIDDLE) == pytest.approx(near)
+
+
 def test_implausible_slope_is_made_level():
     steep = view.Plane(6.0, 0.0, 10.0, 0.0, 0.0)
     found = planes.Fit(steep, 0.1, "ok", "")
