@@ -57,6 +57,8 @@ def whole(path: str | Path, summed: bool = True) -> Iterator[Path]:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if summed:
             sums.write(path, sums.of_file(temporary))
+        else:
+            sums.place(path).unlink(missing_ok=True)
         os.replace(temporary, path)
     except Exception as error:
         raise _told(error, path) from error
