@@ -47,6 +47,7 @@ def contract_of(
         "input": {"channels": "RGB", "scale": 1.0, "mean": [127.0] * 3, "std": [128.0] * 3},
         "geometry_input": True,
         "upright": True,
+        "flips": 8,  # where nothing leans, or nobody knows how
         "thresholds": {**THRESHOLDS[task], **facts.get("thresholds", {})},
         "trained_on": {
             "view_elevation": [45, 90],
@@ -65,7 +66,7 @@ def contract_of(
     contract["trained_on"] = {key: value for key, value in trained.items() if value is not None}
     contract["trained_on"].update({k: facts[k] for k in ("seed", "commit") if k in facts})
     if family == "maskrcnn":
-        del contract["geometry_input"], contract["upright"]
+        del contract["geometry_input"], contract["upright"], contract["flips"]
         contract.update(maskrcnn.contract_terms(task, heights or (6.0, 4.0)))
         contract["thresholds"].update(facts.get("thresholds", {}))
     elif task == "corners":

@@ -67,7 +67,7 @@ def open_network(model: contracts.Model, geometry: np.ndarray, provider: str = "
     """A function from an image (s, s, 3) uint8 to the model's named outputs without their batch axis.
 
     Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged; those
-    that want tiles `upright` see the one view in which roofs lean up.
+    that want tiles `upright` see the one view in which roofs lean up, where the lean is known and not zero.
     `geometry` (1, 6) goes to models whose contract asks for it. `provider` is a key of `PROVIDERS`; `threads` within an
     operator. Raises `ProviderMissing`.
     """
@@ -103,7 +103,8 @@ def open_network(model: contracts.Model, geometry: np.ndarray, provider: str = "
 
     if not dense:
         return lambda rgb: run(rgb, geometry)
-    views = [upright(geometry)] if model.contract.get("upright") else FLIPS[: model.contract.get("flips", 1)]
+    leans = bool(model.contract.get("upright")) and bool(geometry[0, :2].any())
+    views = [upright(geometry)] if leans else FLIPS[: model.contract.get("flips", 1)]
 
     def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
         total: dict[str, np.ndarray] = {}

@@ -84,3 +84,14 @@ class TestRecord:
         path.write_bytes(path.read_bytes() + b"\0")
         with pytest.raises(contract.ContractMismatch, match="changed"):
             runtime.from_record(tmp_path / "sections.json", "sections")
+
+
+def test_upright_is_the_one_symmetry_in_which_roofs_lean_up():
+    """Every lean has a view in which it points up and not right, less left than up; a zero one leaves the tile as it is."""
+    rng = np.random.default_rng(0)
+    for vector in rng.normal(size=(50, 2)):
+        geometry = np.float32([[*vector, 0, 0, 1, 0]])
+        col, row = runtime.upright(geometry).geometry(geometry)[0, :2]
+        assert row <= 0 <= -col <= -row
+        assert np.hypot(col, row) == pytest.approx(np.hypot(*vector), rel=1e-6)
+    assert runtime.upright(np.zeros((1, 6), np.float32)) == runtime.FLIPS[0]
