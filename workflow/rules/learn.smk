@@ -38,7 +38,7 @@ rule trained:
         "runs/{name}/logs/training_{network}.log",
     conda:
         LEARN
-    threads: workflow.cores
+    threads: 64  # Snakemake lowers it to what there is
     params:
         options=lambda w: RECIPE.training[w.network],
         own=lambda w: [f"runs/{w.name}/own/{own}" for own in RECIPE.own],
