@@ -103,13 +103,14 @@ def read_layer(path: str | Path, frame: str) -> Layer:
 
 def _sound(shapes: NDArray[np.object_], called: str) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
     """Single valid polygons with an area, and the row each comes from."""
-    crossed = ~shapely.is_valid(shapes) & ~shapely.is_missing(shapes)
-    if crossed.any():
-        rows = ", ".join(map(str, np.flatnonzero(crossed)[:5] + 1))
-        print(f"warning: {called}: {crossed.sum()} outlines cross themselves (rows {rows}): repaired", file=sys.stderr)
-        shapes = shapes.copy()
-        shapes[crossed] = shapely.make_valid(shapes[crossed])
+    # Parts first: two sections of one row may share an edge, which no valid multipolygon may.
     parts, source = shapely.get_parts(shapes, return_index=True)
+    crossed = ~shapely.is_valid(parts)
+    if crossed.any():
+        rows = ", ".join(map(str, np.unique(source[crossed])[:5] + 1))
+        print(f"warning: {called}: {crossed.sum()} outlines cross themselves (rows {rows}): repaired", file=sys.stderr)
+        parts = parts.copy()
+        parts[crossed] = shapely.make_valid(parts[crossed])
     deeper, inner = shapely.get_parts(parts, return_index=True)
     keep = (shapely.get_type_id(deeper) == shapely.GeometryType.POLYGON) & (shapely.area(deeper) > 0)
     return deeper[keep], source[inner][keep]

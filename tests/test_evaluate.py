@@ -11,7 +11,7 @@ import toy_city as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kibs_steps import evaluate, metrics, store, truth, view
+from kibs_steps import evaluate, metrics, store, sums, truth, view
 from kibs_steps.metrics import Corners
 from kibs_steps.publish import rasters
 
@@ -307,6 +307,7 @@ def test_nothing_found(tmp_path):
         profile.update(driver="GTiff")
         with rasterio.open(tmp_path / name, "w", **profile) as file:
             file.write(np.full(shape, fill, profile["dtype"]), 1)
+        sums.place(tmp_path / name).unlink()
     arguments = ["--scene", scene.folder / "scene.json", "--sections", tmp_path / "buildings.parquet"]
     arguments += ["--labels", tmp_path / "labels.tif", "--heights", tmp_path / "heights.tif"]
     arguments += ["--truth", tmp_path / "truth.parquet", "--out", tmp_path / "evaluation.json"]

@@ -9,7 +9,7 @@ import rasterio
 from scipy import ndimage
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks/scale"))
-import rasters
+import patchwork
 import rivals
 import watch
 
@@ -31,7 +31,7 @@ def test_passes_of_a_model():
 
 
 def test_no_patch_shows_the_scene_of_a_neighbour():
-    numbers = rasters.chosen(12, 15, 6, np.random.default_rng(1))
+    numbers = patchwork.chosen(12, 15, 6, np.random.default_rng(1))
     for down, right in ((0, 1), (1, 0), (1, 1)):
         assert (numbers[: 12 - down, : 15 - right] != numbers[down:, right:]).all()
     assert (numbers[1:, :-1] != numbers[:-1, 1:]).all()
@@ -39,7 +39,7 @@ def test_no_patch_shows_the_scene_of_a_neighbour():
 
 
 def test_a_raster_is_put_together_whole_and_the_same_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(rasters, "PATCH", 64)
+    monkeypatch.setattr(patchwork, "PATCH", 64)
     scenes = []
     for k in range(6):
         scenes.append(tmp_path / f"scene{k}")
@@ -50,7 +50,7 @@ def test_a_raster_is_put_together_whole_and_the_same_again(tmp_path, monkeypatch
         ) as out:
             out.write(image)
     for name in ("a.tif", "b.tif"):
-        rasters.raster(tmp_path / name, 300, 200, scenes)
+        patchwork.raster(tmp_path / name, 300, 200, scenes)
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
     with rasterio.open(tmp_path / "a.tif") as source:
         values = source.read()

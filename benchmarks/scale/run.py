@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 import rasterio
 
 sys.path.insert(0, str(Path(__file__).parent))
-import rasters
+import patchwork
 import rivals
 import watch
 
@@ -51,7 +51,7 @@ def snakemake(scene: str, folder: Path, models: str, cores: int, *flags: str) ->
         "raster": folder / "raster.tif",
         "dtm": folder / "dtm.tif",
         "models": models,
-        **rasters.VIEW,
+        **patchwork.VIEW,
     }
     config = [f"{key}={value}" for key, value in settings.items()]
     call = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", str(cores), *flags]
@@ -228,16 +228,16 @@ def main() -> None:
     args = parser.parse_args()
     out = args.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    scenes = rasters.library(out / "library", args.library)
-    dense = measured(out, "buildings per km2", lambda: round(rasters.density(scenes), 1))
-    if dense < rasters.DENSEST:
-        print(f"warning: {dense} buildings per km², {rasters.DENSEST} are wanted", file=sys.stderr)
+    scenes = patchwork.library(out / "library", args.library)
+    dense = measured(out, "buildings per km2", lambda: round(patchwork.density(scenes), 1))
+    if dense < patchwork.DENSEST:
+        print(f"warning: {dense} buildings per km², {patchwork.DENSEST} are wanted", file=sys.stderr)
     for size in args.sizes:
         folder = out / f"raster{size}"
         folder.mkdir(exist_ok=True)
         if not (folder / "dtm.tif").exists():
-            rasters.raster(folder / "raster.tif", *SIZES[size], scenes)
-            rasters.terrain(folder / "dtm.tif", *SIZES[size])
+            patchwork.raster(folder / "raster.tif", *SIZES[size], scenes)
+            patchwork.terrain(folder / "dtm.tif", *SIZES[size])
 
     files = model_files(args.models)
     from kibs_steps.models import contract
