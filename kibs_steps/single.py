@@ -67,7 +67,8 @@ def main(argv: list[str] | None = None) -> None:
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
-    geometry = runtime.geometry_vector(facts.view and facts.view.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
+    seen = facts.view_of(core)
+    geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry, args.provider, args.threads)
     views, table = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
     sections.write(views, valid, tiling, core, args.seam_rule, args)
