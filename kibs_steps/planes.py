@@ -30,8 +30,10 @@ SIGMA_FLOOR = 0.02  # m
 TUKEY = 4.0  # residuals beyond 4 σ do not count
 MOST_STARTS = 12  # points whose triples are tried: 220 planes
 MAX_SLOPE = 72.0  # deg, in the map frame
+MAX_STRETCH = 8.0  # a section's area as it stands is at most so many times its area as seen: beyond, it is seen edge-on
 MIN_HEIGHT = 0.3  # m above ground: lower, and it is no roof
 MAX_HEIGHT = 200.0  # m above ground: taller than any building of a city without high-rises is a mistake
+DEEPEST = -10.0  # m: no part of a roof is so far below the ground at its middle
 MIN_AREA = 12.0  # px: smaller areas are specks, not roofs
 TRIANGLE = (0.2, 2.0)  # share of the section's area between which its triangle is trusted (PAPER, planes)
 
@@ -54,6 +56,20 @@ class Points(NamedTuple):
     def take(self, index: np.ndarray) -> Points:
         """The chosen points."""
         return Points(*(column[index] for column in self))
+
+
+class Rim(NamedTuple):
+    """A section's outline where it is seen (n, 2; image map frame, m), the height the image was projected on there (m), and
+    the lean of the view (2,)."""
+
+    seen: np.ndarray
+    base: np.ndarray
+    lean: np.ndarray
+
+    def heights(self, plane: Plane) -> np.ndarray:
+        """Lowest and highest absolute height (m) of the outline on a plane that faces the view."""
+        _, z = view.ray_meets_plane(self.seen, plane, self.lean, lambda _: self.base)
+        return np.array([z.min(), z.max()])
 
 
 class Fit(NamedTuple):
@@ -207,27 +223,43 @@ def fit(
     return Fit(plane, sigma, "ok", "")
 
 
+def implausible_slope(plane: Plane, lean: np.ndarray) -> str:
+    """Why a plane is too steep for a roof that the satellite sees, empty if it is not; `lean` (2,) of the view."""
+    slope = np.degrees(np.arctan(np.hypot(plane.a, plane.b)))
+    if slope > MAX_SLOPE:
+        return f"fitted slope {slope:.0f}° exceeds {MAX_SLOPE:.0f}°; made level"
+    facing = 1.0 - (plane.a * lean[0] + plane.b * lean[1])
+    if facing < 1.0 / MAX_STRETCH:
+        how = "faces away from the view" if facing <= 0 else "would be seen edge-on"
+        return f"a fitted slope of {slope:.0f}° in its direction {how}; made level"
+    return ""
+
+
 def checked(
     found: Fit,
     points: Points,
     area_px: float,
     ground: float,
     middle: np.ndarray,
+    rim: Rim,
     edge: bool,
     void: bool,
 ) -> Fit:
     """The fit with its plausibility: slope, height, size, place in the raster. What comes first in DESIGN's list gives way.
 
-    An implausible slope is replaced by a level plane at the corners' median height, an implausible height by one at the nearest
-    plausible height: an absurd one would move the outline along the view to where nothing stands.
+    An implausible slope is replaced by a level plane at the corners' median height, and so is a plane that leaves the plausible
+    heights at its rim; an implausible mean height by a level plane at the nearest plausible one. An absurd plane would move the
+    outline along the view to where nothing stands.
     """
-    slope = np.degrees(np.arctan(np.hypot(found.plane.a, found.plane.b)))
-    if slope > MAX_SLOPE:
-        level = flat(ground + float(np.median(points.height)), middle)
-        found = Fit(
-            level, found.sigma, "implausible_slope", f"fitted slope {slope:.0f}° exceeds {MAX_SLOPE:.0f}°; made level"
-        )
+    typical = ground + (float(np.median(points.height)) if len(points.height) else 0.0)
+    if reason := implausible_slope(found.plane, rim.lean):
+        found = Fit(flat(typical, middle), found.sigma, "implausible_slope", reason)
     height = float(found.plane.at(middle)) - ground
+    lowest, highest = rim.heights(found.plane) - ground
+    if MIN_HEIGHT <= height <= MAX_HEIGHT and (lowest < DEEPEST or highest > MAX_HEIGHT):
+        reason = f"fitted from {lowest:.0f} m to {highest:.0f} m above the ground; made level"
+        found = Fit(flat(typical, middle), found.sigma, "implausible_height", reason)
+        height = typical - ground
     if not MIN_HEIGHT <= height <= MAX_HEIGHT:
         near = float(np.clip(height, MIN_HEIGHT, MAX_HEIGHT))
         reason = f"mean height {height:.1f} m above ground; made level at {near:g} m"
@@ -235,7 +267,9 @@ def checked(
     if area_px < MIN_AREA:
         found = found._replace(status="too_small", reason=f"{area_px:.0f} px is too small to be trusted")
     if void:
-        found = found._replace(status="cloud_or_nodata", reason="touches an area without data: its outline is cut")
+        found = found._replace(
+            status="cloud_or_nodata", reason="touches an area without data, or a tile burnt out (cloud, snow)"
+        )
     if edge:
         found = found._replace(status="raster_edge", reason="cut by the raster's edge: its outline goes on outside")
     return found
@@ -274,9 +308,15 @@ def planes(
     middle, _ = view.ground_position(centre, typical, dtm, lean, base)
     ground = dtm(middle)
     edge, void = sections["edge"].to_pylist(), sections["void"].to_pylist()
+    outline, of = shapely.get_coordinates(outlines, return_index=True)
+    seen = facts.grid.to_map(outline)
+    projected = base(seen)
+    vertices = np.searchsorted(of, np.arange(len(outlines) + 1))
     for i, mine in enumerate(parts):
         found = fit(mine, area_px[i], middle[i], ground[i], fallback, rule)
-        found = checked(found, mine, area_px[i], float(ground[i]), middle[i], edge[i], void[i])
+        own = slice(vertices[i], vertices[i + 1])
+        rim = Rim(seen[own], projected[own], lean[i])
+        found = checked(found, mine, area_px[i], float(ground[i]), middle[i], rim, edge[i], void[i])
         rows.append([*found.plane, found.sigma, len(mine.z), found.status, found.reason])
     table = sections.select(["section_id", "outline", "score", "split"])
     for k, (name, kind) in enumerate(PLANE_FIELDS):

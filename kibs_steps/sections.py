@@ -28,6 +28,10 @@ SIDES = ("north", "south", "west", "east")
 SEAM_RULES = ("overlap", "touch")
 
 
+WHITE = 250  # of 255, in all bands: clipped
+BURNT = 0.5  # share of a tile's data
+
+
 class View(NamedTuple):
     """What one tile sees: labels (s, s) int32 over its full window, zero outside the data, and a score per label."""
 
@@ -184,8 +188,9 @@ PIECES = pa.schema(
 )
 
 
-def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -> pa.Table:
-    """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it borders on no data.
+def pieces(views: list[View], clear: np.ndarray, tiling: Tiling, core: Window) -> pa.Table:
+    """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it is void, which is in or
+    beside pixels that are not `clear` (no data, burnt out).
 
     `split` and `owner` are for truth that is fed instead of detections: 2 (none) and 0 here.
     """
@@ -197,7 +202,7 @@ def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -
         full = np.bincount(view.labels.ravel(), minlength=1)
         own = np.bincount(inside.ravel(), minlength=len(full))
         place = window_in_block(view.tile.core, core, p)
-        blank = ~valid[place.row : place.row + place.height, place.col : place.col + place.width]
+        blank = ~clear[place.row : place.row + place.height, place.col : place.col + place.width]
         near_blank = set(np.unique(inside[grown(blank)]).tolist()) if blank.any() else set()
         first = int(view.labels[view.labels > 0].min(initial=np.iinfo(np.int32).max))
         for label in np.unique(view.labels[view.labels > 0]).tolist():
@@ -217,6 +222,21 @@ def pieces(views: list[View], valid: np.ndarray, tiling: Tiling, core: Window) -
                 }
             )
     return pa.Table.from_pylist(rows, schema=PIECES)
+
+
+def burnt_out(rgb: np.ndarray, valid: np.ndarray, views: list[View], tiling: Tiling, core: Window) -> np.ndarray:
+    """Where the tiles of a block (its `core` with margins) show cloud, snow or glare instead of ground, bool (h, w).
+
+    A tile does when most of its data is clipped to white: a white roof alone never fills a tile of a hundred metres.
+    """
+    found = np.zeros(valid.shape, bool)
+    for view in views:
+        place = window_in_block(view.tile.core, core, tiling.margin)
+        part = np.s_[place.row : place.row + place.height, place.col : place.col + place.width]
+        data = valid[part]
+        white = data & (rgb[part] >= WHITE).all(axis=-1)
+        found[part] = white.sum() > BURNT * max(data.sum(), 1)
+    return found
 
 
 def grown(mask: np.ndarray) -> np.ndarray:
@@ -260,12 +280,12 @@ def unstack(image: np.ndarray, tiles: list[Tile], side: int) -> dict[tuple[int, 
 
 
 def write(
-    views: list[View], valid: np.ndarray, tiling: Tiling, core: Window, rule: str, out: argparse.Namespace
+    views: list[View], clear: np.ndarray, tiling: Tiling, core: Window, rule: str, out: argparse.Namespace
 ) -> None:
     """Write what the tiles of a block see to the files `out` names: labels, pieces, links, seams."""
     links = inner_links(views, tiling.margin, rule)
     raster.write(out.labels, stack({(v.tile.row, v.tile.col): v.labels.astype(np.uint32) for v in views}, tiling.tile))
-    store.write_table(out.pieces, pieces(views, valid, tiling, core))
+    store.write_table(out.pieces, pieces(views, clear, tiling, core))
     store.write_table(out.links, pa.table({"first": links[:, 0], "second": links[:, 1]}))
     store.write_arrays(out.seams, seams(views, tiling.margin))
 
@@ -299,7 +319,8 @@ def main(argv: list[str] | None = None) -> None:
     geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry, args.provider, args.threads)
     views = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
-    write(views, valid, tiling, core, args.seam_rule, args)
+    clear = valid & ~burnt_out(rgb, valid, views, tiling, core)
+    write(views, clear, tiling, core, args.seam_rule, args)
 
 
 if __name__ == "__main__":

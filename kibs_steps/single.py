@@ -71,7 +71,8 @@ def main(argv: list[str] | None = None) -> None:
     geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry, args.provider, args.threads)
     views, table = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
-    sections.write(views, valid, tiling, core, args.seam_rule, args)
+    clear = valid & ~sections.burnt_out(rgb, valid, views, tiling, core)
+    sections.write(views, clear, tiling, core, args.seam_rule, args)
     store.write_table(args.corners, table)
 
 

@@ -153,6 +153,9 @@ def test_owned_corners_go_to_their_owner_only():
     assert (section.tolist(), corner.tolist()) == ([1], [0])
 
 
+RIM = planes.Rim(np.array([[0.0, 0.0], [8.0, 0.0], [8.0, 6.0], [0.0, 6.0]]), np.zeros(4), np.array([0.0, -0.594]))
+
+
 @pytest.mark.parametrize(
     ("change", "status"),
     [
@@ -165,7 +168,7 @@ def test_owned_corners_go_to_their_owner_only():
 )
 def test_statuses(change, status):
     found = planes.fit(on_plane(SQUARE), 80.0, MIDDLE, 0.0, (6.11, 3.0), "robust")
-    arguments = {"area_px": 400.0, "ground": 0.0, "middle": MIDDLE, "edge": False, "void": False, **change}
+    arguments = {"area_px": 400.0, "ground": 0.0, "middle": MIDDLE, "rim": RIM, "edge": False, "void": False, **change}
     result = planes.checked(found, on_plane(SQUARE), **arguments)
     assert result.status == status
     assert bool(result.reason) == (status != "ok")
@@ -174,15 +177,28 @@ def test_statuses(change, status):
 @pytest.mark.parametrize(("height", "near"), [(-1086.0, 0.3), (0.2, 0.3), (900.0, planes.MAX_HEIGHT)])
 def test_implausible_height_is_made_level_at_the_nearest_plausible_one(height, near):
     absurd = planes.Fit(view.Plane(0.5, 0.0, height, *MIDDLE), 0.1, "ok", "")
-    result = planes.checked(absurd, on_plane(SQUARE), 400.0, 0.0, MIDDLE, False, False)
+    result = planes.checked(absurd, on_plane(SQUARE), 400.0, 0.0, MIDDLE, RIM, False, False)
     assert result.status == "implausible_height"
     assert (result.plane.a, result.plane.b) == (0, 0)
     assert result.plane.at(MIDDLE) == pytest.approx(near)
 
 
-def test_implausible_slope_is_made_level():
-    steep = view.Plane(6.0, 0.0, 10.0, 0.0, 0.0)
+# The satellite stands in the south: a roof that rises toward it by more than tan 59.3° shows its back.
+@pytest.mark.parametrize(("a", "b", "why"), [(6.0, 0.0, "exceeds"), (0.0, -1.75, "away"), (0.0, -1.6, "edge-on")])
+def test_implausible_slope_is_made_level(a, b, why):
+    steep = view.Plane(a, b, 10.0, *MIDDLE)
     found = planes.Fit(steep, 0.1, "ok", "")
-    result = planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, False, False)
+    result = planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, RIM, False, False)
     assert result.status == "implausible_slope"
+    assert why in result.reason
     assert (result.plane.a, result.plane.b) == (0, 0)
+
+
+def test_plane_that_dives_into_the_ground_is_made_level():
+    """As steep as a roof may be, but over a section as long as no roof is steep."""
+    long = planes.Rim(RIM.seen * [1.0, 20.0], RIM.base, RIM.lean)
+    found = planes.Fit(view.Plane(0.0, -1.2, 8.0, *MIDDLE), 0.1, "ok", "")
+    result = planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, long, False, False)
+    assert result.status == "implausible_height"
+    assert (result.plane.a, result.plane.b) == (0, 0)
+    assert planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, RIM, False, False).status == "ok"

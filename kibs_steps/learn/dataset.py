@@ -384,12 +384,12 @@ def radiometry(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Another sensor, stretch and weather over the same scene, uint8 (h, w, 3)."""
     x = rgb.astype(np.float32) / 255
     rows, cols = rgb.shape[:2]
-    if rng.random() < 0.5:  # coarser pixels drawn larger, as pansharpened and resampled imagery is
-        factor = rng.uniform(1.0, 2.2)
+    if rng.random() < 0.4:  # coarser pixels drawn larger, as pansharpened and resampled imagery is
+        factor = rng.uniform(1.0, 1.7)
         small = cv2.resize(x, (round(cols / factor), round(rows / factor)), interpolation=cv2.INTER_AREA)
         x = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC if rng.random() < 0.5 else cv2.INTER_LINEAR)
-    if rng.random() < 0.35:
-        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 1.4))
+    if rng.random() < 0.3:
+        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 1.0))
     if rng.random() < 0.25:  # colours coarser than brightness, as after pansharpening
         grey = x.mean(2, keepdims=True)
         x = grey + cv2.GaussianBlur(x - grey, (0, 0), rng.uniform(0.8, 2.5))

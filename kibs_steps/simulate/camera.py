@@ -30,6 +30,23 @@ class Camera(NamedTuple):
     jpeg: int  # quality, 0 none
 
 
+CLEAR = Camera(  # what is ordered for mapping: little haze, sharp optics, stretched over its whole range
+    blur=0.55,
+    haze=(0.035, 0.06, 0.1),
+    noise=0.004,
+    chroma=0.8,
+    fringe=(0.0, 0.0),
+    sharpen=0.4,
+    gamma=1.8,
+    dark=0.002,
+    bright=0.004,
+    top=0.98,
+    balance=(1.0, 1.0, 1.0),
+    saturation=0.95,
+    jpeg=0,
+)
+
+
 def camera(rng: np.random.Generator) -> Camera:
     """A camera and its processing, drawn at random."""
     blue = 0.04 + rng.gamma(1.2, 0.13)

@@ -17,6 +17,7 @@ from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction, convergence
 from kibs_steps.simulate import citymodel, real
+from kibs_steps.simulate.camera import CLEAR, Camera
 from kibs_steps.simulate.city import MIXTURES, STYLES, procedural
 from kibs_steps.simulate.citymodel import CityModel
 from kibs_steps.simulate.draped import House
@@ -141,11 +142,12 @@ def simulate(
     slope: float = 0.0,
     base: float = 100.0,
     model: CityModel | None = None,
+    look: Camera | None = None,
 ) -> tuple[Rendering, Terrain]:
     """One scene over `grid`: its rendering and its terrain (2 m posting, 250 m beyond the grid).
 
     `amplitude` (m) and `slope` (m/m) shape the terrain, `base` (m) is its mean height. With a `model` the scene shows that
-    city where it stands, on its own terrain.
+    city where it stands, on its own terrain. `look`: the camera, drawn at random if None.
     """
     rng = np.random.default_rng(seed)
     left, bottom, right, top = grid.bounds
@@ -154,12 +156,13 @@ def simulate(
     if model:
         terrain = real.surveyed_terrain(model, around, 2.0)
         within = (left - margin, bottom - margin, right + margin, top + margin)
-        return render(real.as_surveyed(rng, model, within, terrain), terrain, grid, view, sun, rng), terrain
+        city = real.as_surveyed(rng, model, within, terrain)
+        return render(city, terrain, grid, view, sun, rng, look=look), terrain
     terrain = relief(rng, around, 2.0, amplitude, slope, base)
     city = procedural(
         rng, right - left + 2 * margin, top - bottom + 2 * margin, terrain, style, (left - margin, bottom - margin)
     )
-    return render(city, terrain, grid, view, sun, rng), terrain
+    return render(city, terrain, grid, view, sun, rng, look=look), terrain
 
 
 def split_of(x_y: np.ndarray, seed: int) -> int:
@@ -268,6 +271,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--sun-azimuth", type=float, default=155.0)
     parser.add_argument("--sun-elevation", type=float, default=45.0)
     parser.add_argument("--style", choices=[*STYLES, *MIXTURES], default="mixed")
+    parser.add_argument(
+        "--look", choices=["any", "clear"], default="any", help="camera and air: drawn at random, or good"
+    )
     parser.add_argument("--relief", type=float, default=0.0, help="amplitude of the terrain's waves in metres")
     parser.add_argument("--slope", type=float, default=0.0, help="slope of the terrain in percent")
     parser.add_argument(
@@ -287,7 +293,10 @@ def main(argv: list[str] | None = None) -> None:
     turned = convergence(grid)
     view = _direction(args.view_azimuth, args.view_elevation, turned)
     sun = _direction(args.sun_azimuth, args.sun_elevation, turned)
-    picture, terrain = simulate(args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0, model=model)
+    look = CLEAR if args.look == "clear" else None
+    picture, terrain = simulate(
+        args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0, model=model, look=look
+    )
     step = terrain.step[0]
     _write_raster(args.out / "scene.tif", picture.rgb, crs, grid.x0, grid.y0, grid.gsd)
     _write_raster(

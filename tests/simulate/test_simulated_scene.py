@@ -8,7 +8,7 @@ from kibs_steps import terrain as dtm
 from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
 from kibs_steps.simulate import scene, works
-from kibs_steps.simulate.camera import Camera
+from kibs_steps.simulate.camera import CLEAR, Camera
 from kibs_steps.simulate.pieces import CLUTTER, OBJECT, ROOF, WALL, City, Face, Paint, Place
 from kibs_steps.simulate.rendering import ON_ROOF, OTHER
 from kibs_steps.simulate.roofs import prism
@@ -82,6 +82,18 @@ def test_tall_building_hides_the_low_one_behind():
     assert not (picture.section == 2).any()
     assert 2 not in picture.corner_sections
     assert {s.section: s.visible for s in shoot(faces, view=(0, 50)).sections}[2] == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_look_changes_the_picture_and_nothing_else():
+    grid = Grid("", 0.0, 60.0, 0.4, 150, 150)
+    view, sun = scene._direction(181, 60), scene._direction(155, 45)
+    clear, blurred = (
+        scene.simulate(5, grid, view, sun, "rows", look=look)[0] for look in (CLEAR, CLEAR._replace(blur=1.6))
+    )
+    assert (clear.section == blurred.section).all()
+    assert np.array_equal(clear.height, blurred.height, equal_nan=True)
+    fine = [np.abs(np.diff(picture.rgb.mean(2), axis=1)).mean() for picture in (clear, blurred)]
+    assert fine[0] > 1.5 * fine[1]
 
 
 def test_things_on_a_roof_belong_to_its_section():

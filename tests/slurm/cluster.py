@@ -140,6 +140,18 @@ class Cluster:
         path.chmod(0o755)
         return path
 
+    def cancel(self) -> None:
+        """Cancel all jobs, as a user does after a killed run (docs/scaling.md), and wait for their end."""
+        user = subprocess.run(["id", "-un"], capture_output=True, text=True, check=True).stdout.strip()
+        subprocess.run(["scancel", "--user", user], env=self.environment, check=True)
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            queue = subprocess.run(["squeue", "--noheader"], env=self.environment, capture_output=True, text=True)
+            if not queue.stdout.strip():
+                return
+            time.sleep(0.2)
+        raise RuntimeError(f"cancelled jobs do not end:\n{queue.stdout}")
+
     def ended(self) -> list[dict[str, str]]:
         """Jobs that came to an end, as Slurm noted them: JobId, JobState, NodeList and so on."""
         file = self.folder / "jobs.txt"

@@ -1,5 +1,5 @@
-"""A scene on a real Slurm of three nodes: a job fails once and is tried again, the run is killed and goes on, bytes are those
-of a local run, blocks are worked on by all nodes."""
+"""A scene on a real Slurm of three nodes: a job fails and is submitted again, the run is killed and goes on, bytes are those of
+a local run, blocks are worked on by all nodes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ def command(*flags: str) -> list[str]:
     """Snakemake on the toy scene."""
     settings = {"scene": "town", "raster": "town.tif", "dtm": 100, "models": "models", "block": 2, **toy.VIEW}
     config = [f"{k}={v}" for k, v in settings.items()]
-    return [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), *flags, "--config", *config]
+    files = [f"results/town/{name}" for name in SAME_BYTES]
+    return [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), *files, *flags, "--config", *config]
 
 
 SLURM = ["--profile", str(ROOT / "workflow/profiles/slurm"), "--slurm-no-account", "--latency-wait", "10", "--nolock"]
@@ -90,6 +91,7 @@ def test_killed_run_with_a_failing_job_gives_the_bytes_of_a_local_run(tmp_path):
             time.sleep(0.1)
         os.killpg(first.pid, signal.SIGKILL)
         first.wait()
+        slurm.cancel()
         assert not (folder / "results/town/city.gpkg").exists()
         again = subprocess.run(command(*SLURM), cwd=folder, env=slurm.environment, capture_output=True, text=True)
         assert again.returncode == 0, again.stdout[-3000:] + again.stderr[-5000:]

@@ -27,7 +27,6 @@ rule sections:
         "results/{scene}/benchmarks/sections/{block}.tsv"
     wildcard_constraints:
         scene=using("two_stage"),
-    retries: 1
     conda:
         RUN
     threads: lambda w: plan(w).settings["threads"]
@@ -61,7 +60,6 @@ rule blend:
         "results/{scene}/logs/blend/{block}.log",
     benchmark:
         "results/{scene}/benchmarks/blend/{block}.tsv"
-    retries: 1
     conda:
         RUN
     params:
@@ -90,7 +88,6 @@ rule corners:
         "results/{scene}/benchmarks/corners/{block}.tsv"
     wildcard_constraints:
         scene=using("two_stage"),
-    retries: 1
     conda:
         RUN
     threads: lambda w: plan(w).settings["threads"]
@@ -133,7 +130,6 @@ rule single:
         "results/{scene}/benchmarks/single/{block}.tsv"
     wildcard_constraints:
         scene=using("single"),
-    retries: 1
     conda:
         RUN
     threads: lambda w: plan(w).settings["threads"]
@@ -165,7 +161,7 @@ rule truth:
         "results/{scene}/logs/truth.log",
     benchmark:
         "results/{scene}/benchmarks/truth.tsv"
-    retries: 1
+    retries: 0
     conda:
         RUN
     params:
@@ -200,7 +196,6 @@ rule feed:
         "results/{scene}/logs/feed/{block}.log",
     benchmark:
         "results/{scene}/benchmarks/feed/{block}.tsv"
-    retries: 1
     conda:
         RUN
     params:
@@ -232,7 +227,6 @@ rule stitch:
         "results/{scene}/logs/stitch.log",
     benchmark:
         "results/{scene}/benchmarks/stitch.tsv"
-    retries: 1
     conda:
         RUN
     params:

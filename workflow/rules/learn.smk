@@ -18,6 +18,7 @@ rule own_samples:
         "runs/{name}/own/{own}/own.json",
     log:
         "runs/{name}/logs/own_{own}.log",
+    retries: 0
     conda:
         LEARN
     params:
@@ -36,6 +37,7 @@ rule trained:
         "runs/{name}/{network}/done.json",
     log:
         "runs/{name}/logs/training_{network}.log",
+    retries: 0
     conda:
         LEARN
     threads: 64  # Snakemake lowers it to what there is
@@ -57,6 +59,7 @@ rule exported:
         "runs/{name}/logs/export_{task}.log",
     wildcard_constraints:
         task="both|sections|corners",
+    retries: 0
     conda:
         LEARN
     shell:
@@ -76,6 +79,7 @@ rule card:
         curves="models/{name}/curves.png",
     log:
         "runs/{name}/logs/card.log",
+    retries: 0
     conda:
         LEARN
     shell:

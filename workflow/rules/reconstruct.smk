@@ -22,6 +22,7 @@ rule edited:
         "results/{scene}/logs/edited.log",
     benchmark:
         "results/{scene}/benchmarks/edited.tsv"
+    retries: 0
     conda:
         RUN
     params:
@@ -50,6 +51,7 @@ rule surface:
         "results/{scene}/logs/surface.log",
     benchmark:
         "results/{scene}/benchmarks/surface.tsv"
+    retries: 0
     conda:
         RUN
     params:
@@ -87,7 +89,6 @@ rule planes:
         "results/{scene}/logs/planes/{block}.log",
     benchmark:
         "results/{scene}/benchmarks/planes/{block}.tsv"
-    retries: 1
     conda:
         RUN
     params:
@@ -117,7 +118,6 @@ rule ground:
         "results/{scene}/logs/ground/{block}.log",
     benchmark:
         "results/{scene}/benchmarks/ground/{block}.tsv"
-    retries: 1
     conda:
         RUN
     params:
@@ -143,7 +143,6 @@ rule buildings:
         "results/{scene}/logs/buildings.log",
     benchmark:
         "results/{scene}/benchmarks/buildings.tsv"
-    retries: 1
     conda:
         RUN
     params:
@@ -176,7 +175,6 @@ rule solids:
         "results/{scene}/logs/solids/{block}.log",
     benchmark:
         "results/{scene}/benchmarks/solids/{block}.tsv"
-    retries: 1
     conda:
         RUN
     params:

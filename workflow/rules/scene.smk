@@ -11,6 +11,7 @@ rule simulated:
         "results/{scene}/logs/simulated.log",
     benchmark:
         "results/{scene}/benchmarks/simulated.tsv"
+    retries: 0
     conda:
         RUN
     params:
@@ -42,6 +43,7 @@ rule scene:
         "results/{scene}/logs/scene.log",
     benchmark:
         "results/{scene}/benchmarks/scene.tsv"
+    retries: 0
     conda:
         RUN
     params:
@@ -98,7 +100,6 @@ rule tiles:
         "results/{scene}/logs/tiles/{block}.log",
     benchmark:
         "results/{scene}/benchmarks/tiles/{block}.tsv"
-    retries: 1
     conda:
         RUN
     params:
@@ -123,6 +124,7 @@ rule model:
         "results/{scene}/logs/model_{task}.log",
     benchmark:
         "results/{scene}/benchmarks/model_{task}.tsv"
+    retries: 0
     localrule: True
     conda:
         RUN
