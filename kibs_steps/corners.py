@@ -3,7 +3,8 @@
 A tile answers for the corners in its core; those up to `SEAM` px beyond are kept too, because two tiles may each place a
 corner on the seam just across it. `stitch` keeps one of the two.
 
-In: `blended.tif`, the model. Out: `corners.parquet`: tile, position (px, image coordinates), height and σ (m), score.
+In: `blended.tif`, `sections.tif`, the model. Out: `corners.parquet`: tile, position (px, image coordinates), height and σ (m),
+score; `heights.parquet`: what the model's height map says of every piece of a section (`heightmap`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 
-from kibs_steps import cli, raster, scene, sections, store
+from kibs_steps import cli, heightmap, raster, scene, sections, store
 from kibs_steps.grid import Tile, Tiling
 
 if TYPE_CHECKING:
@@ -52,6 +53,19 @@ def of_tile(found: heads.Corners, tile: Tile, tiling: Tiling) -> pa.Table:
     return pa.table(columns, schema=CORNERS)
 
 
+def heights_of_tile(
+    found: tuple[np.ndarray, np.ndarray] | None, labels: np.ndarray, tile: Tile, tiling: Tiling
+) -> pa.Table:
+    """Sums of a tile's height map (`heads.height_map`) over each label (s, s) in the tile's core."""
+    if found is None:
+        return heightmap.HEIGHTS.empty_table()
+    p, window = tiling.margin, tiling.window(tile)
+    core = np.zeros_like(labels)
+    inside = np.s_[p : p + tile.core.height, p : p + tile.core.width]
+    core[inside] = labels[inside]
+    return heightmap.table(*heightmap.sums_by_label(core, *found, window.col, window.row))
+
+
 def main(argv: list[str] | None = None) -> None:
     """Find the roof corners of one block and their heights."""
     from kibs_steps.models import heads, runtime
@@ -59,12 +73,14 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.corners", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
     parser.add_argument("--blended", required=True, help="blended.tif of the block")
+    parser.add_argument("--labels", required=True, help="sections.tif of the block")
     parser.add_argument("--model", required=True, help="models/corners.json")
     parser.add_argument("--name", required=True, help="block name")
     parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
     runtime.add_options(parser)
-    parser.add_argument("--out", required=True, help="corners.parquet")
+    parser.add_argument("--out", required=True, help="out: corners.parquet")
+    parser.add_argument("--heights", required=True, help="out: heights.parquet")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     model = runtime.from_record(args.model, "corners")
@@ -75,11 +91,15 @@ def main(argv: list[str] | None = None) -> None:
     seen = facts.view_of(tiling.block_core(block, facts.grid.width, facts.grid.height))
     geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry, args.provider, args.threads)
-    tables = [CORNERS.empty_table()]
+    labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
+    tables, heights = [CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile in tiles:
-        image = images[tile.row, tile.col]
-        tables.append(of_tile(heads.decode_corners(network(image), model.contract), tile, tiling))
+        place = tile.row, tile.col
+        outputs = network(images[place])
+        tables.append(of_tile(heads.decode_corners(outputs, model.contract), tile, tiling))
+        heights.append(heights_of_tile(heads.height_map(outputs, model.contract), labels[place], tile, tiling))
     store.write_table(args.out, pa.concat_tables(tables))
+    store.write_table(args.heights, pa.concat_tables(heights))
 
 
 if __name__ == "__main__":

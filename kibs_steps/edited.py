@@ -22,6 +22,7 @@ from kibs_steps import cli, scene, store
 from kibs_steps.corners import CORNERS
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid, Tiling
+from kibs_steps.heightmap import EMPTY
 from kibs_steps.stitch import SECTIONS, distinct_corners, owner_blocks, section_ids, touches_edge
 
 LAYER = "roof_sections_image"
@@ -116,9 +117,9 @@ def edited(
     values: dict[str, list] = {name: [] for name in SECTIONS.names}
     for k, row in enumerate(rows):
         found = {"section_id": int(ids[k]), "outline": shapely.to_wkb(outlines[k]), "score": 1.0, "split": 2}
-        found |= {"edge": bool(edge[k]), "void": False, "owner": 0}
+        found |= {"edge": bool(edge[k]), "void": False, "owner": 0, "sums": EMPTY}
         if row is not None:
-            found |= {name: column[name][row] for name in ("score", "split", "void")}
+            found |= {name: column[name][row] for name in ("score", "split", "void", "sums")}
         if not touched[k]:
             found = {name: column[name][row] for name in SECTIONS.names}
         for name, value in found.items():

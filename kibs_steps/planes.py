@@ -5,8 +5,9 @@ faces away), so corners are first moved to where they stand (PAPER, off-nadir ge
 
 Two rules. `paper`: the three corners of the largest triangle; a triangle under 20 % or over 200 % of the section's area is
 not trusted; two corners or one give a flat plane at their mean height, none the model's mean height. `robust` (default):
-least squares over all corners, weighted by 1/σ², outliers by Tukey's biweight, with a weak prior on the slope so that corners
-in a row leave the plane level across that row. Every section keeps a **status** with its reason.
+least squares over all corners and the cells of the model's height map (`heightmap`), weighted by 1/σ², outliers by Tukey's
+biweight, with a weak prior on the slope so that corners in a row leave the plane level across that row. Every section keeps a
+**status** with its reason.
 
 In: stitched sections and corners, DTM, view. Out: `planes.parquet`, `filed_corners.parquet`.
 """
@@ -21,13 +22,15 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, scene, store, view
+from kibs_steps import cli, heightmap, scene, store, view
 from kibs_steps.view import Plane
 
 SHARED = 2.0  # px: a corner on a ridge or eave belongs to every section whose rim is as near, up to this
 SLOPE_PRIOR = 0.7  # standard deviation of a roof's gradient per axis: 35° is ordinary, 60° is rare
 SIGMA_FLOOR = 0.02  # m
 TUKEY = 4.0  # residuals beyond 4 σ do not count
+COMMON = 0.7  # share of the height map's σ that all of a section has in common
+ENOUGH = 2  # cells of the height map that give a section its plane without corners
 MOST_STARTS = 12  # points whose triples are tried: 220 planes
 MAX_SLOPE = 72.0  # deg, in the map frame
 MAX_STRETCH = 8.0  # a section's area as it stands is at most so many times its area as seen: beyond, it is seen edge-on
@@ -56,6 +59,21 @@ class Points(NamedTuple):
     def take(self, index: np.ndarray) -> Points:
         """The chosen points."""
         return Points(*(column[index] for column in self))
+
+    def joined(self, other: Points) -> Points:
+        """These points, then the others."""
+        return Points(*map(np.concatenate, zip(self, other, strict=True)))
+
+
+class Cells(NamedTuple):
+    """What the height map says of a section: points that fix its plane (`heightmap.points`), number of cells, their σ (m)."""
+
+    points: Points
+    n: float
+    sigma: float
+
+
+NO_CELLS = Cells(Points(*np.zeros((7, 0))), 0.0, 0.0)
 
 
 class Rim(NamedTuple):
@@ -192,31 +210,45 @@ def triangle_plane(points: Points, triple: tuple[int, int, int], middle: np.ndar
 
 
 def fit(
-    points: Points, area: float, middle: np.ndarray, ground: float, fallback: tuple[float, float], rule: str
+    corners: Points,
+    area: float,
+    middle: np.ndarray,
+    ground: float,
+    fallback: tuple[float, float],
+    rule: str,
+    cells: Cells = NO_CELLS,
 ) -> Fit:
-    """A section's plane from its corners.
+    """A section's plane from its corners and, by the rule `robust`, the cells of the height map.
 
     `area` px² of the section as seen, `middle` (2,) map m, `ground` DTM there (m), `fallback` the model's mean height and σ
     (m above ground), `rule` robust or paper.
     """
-    n = len(points.z)
+    n = len(corners.z)
+    share = largest_triangle(corners.col, corners.row)[1] / max(area, 1e-9) if n > 2 else 0.0
+    if rule == "robust" and cells.n:
+        plane, sigma = robust_plane(corners.joined(cells.points), middle)
+        sigma = max(sigma, COMMON * cells.sigma)
+        if cells.n >= ENOUGH or share >= TRIANGLE[0]:
+            return Fit(plane, sigma, "ok", "")
+        status = ("no_corners", "one_corner", "two_corners", "degenerate_triangle")[min(n, 3)]
+        return Fit(
+            plane, sigma, status, f"{n} corners and {cells.n:.0f} cells of the height map are too few for a slope"
+        )
     if n == 0:
         reason = f"no corner was found; the model's mean height {fallback[0]:.2f} m is used"
         return Fit(flat(ground + fallback[0], middle), fallback[1], "no_corners", reason)
     if n < 3:
-        sigma = float(np.sqrt((np.maximum(points.sigma, SIGMA_FLOOR) ** 2).sum()) / n)
+        sigma = float(np.sqrt((np.maximum(corners.sigma, SIGMA_FLOOR) ** 2).sum()) / n)
         status = "one_corner" if n == 1 else "two_corners"
         reason = f"{'one corner gives' if n == 1 else 'two corners give'} a level plane at the mean height"
-        return Fit(flat(ground + points.height.mean(), middle), sigma, status, reason)
-    triple, triangle = largest_triangle(points.col, points.row)
-    share = triangle / max(area, 1e-9)
-    plane, sigma = robust_plane(points, middle)
+        return Fit(flat(ground + corners.height.mean(), middle), sigma, status, reason)
+    plane, sigma = robust_plane(corners, middle)
     trusted = share >= TRIANGLE[0] and (share <= TRIANGLE[1] or rule == "robust")
     if rule == "paper":
         if not trusted:
             reason = f"largest triangle of corners is {share:.0%} of the section; level at the model's mean height"
             return Fit(flat(ground + fallback[0], middle), fallback[1], "degenerate_triangle", reason)
-        plane = triangle_plane(points, triple, middle)
+        plane = triangle_plane(corners, largest_triangle(corners.col, corners.row)[0], middle)
     elif not trusted:
         reason = f"corners span {share:.0%} of the section: level across the direction they do not span"
         return Fit(plane, sigma, "degenerate_triangle", reason)
@@ -237,7 +269,7 @@ def implausible_slope(plane: Plane, lean: np.ndarray) -> str:
 
 def checked(
     found: Fit,
-    points: Points,
+    heights: np.ndarray,
     area_px: float,
     ground: float,
     middle: np.ndarray,
@@ -247,11 +279,12 @@ def checked(
 ) -> Fit:
     """The fit with its plausibility: slope, height, size, place in the raster. What comes first in DESIGN's list gives way.
 
-    An implausible slope is replaced by a level plane at the corners' median height, and so is a plane that leaves the plausible
-    heights at its rim; an implausible mean height by a level plane at the nearest plausible one. An absurd plane would move the
-    outline along the view to where nothing stands.
+    `heights` (n,) are those its corners and cells have above ground (m), `area_px` its area as seen, `ground` the DTM (m) at its
+    `middle` (map, m). An implausible slope is replaced by a level plane at the median of `heights`, and so is a plane that
+    leaves the plausible heights at its rim; an implausible mean height by a level plane at the nearest plausible one. An absurd
+    plane would move the outline along the view to where nothing stands.
     """
-    typical = ground + (float(np.median(points.height)) if len(points.height) else 0.0)
+    typical = ground + (float(np.median(heights)) if len(heights) else 0.0)
     if reason := implausible_slope(found.plane, rim.lean):
         found = Fit(flat(typical, middle), found.sigma, "implausible_slope", reason)
     height = float(found.plane.at(middle)) - ground
@@ -298,25 +331,41 @@ def planes(
     centre = middle_of(outlines, facts)
     lean = facts.leans(centre)
     pixel, height = pixel[corner], corners["height"].to_numpy()[corner]
-    where, z = view.ground_position(facts.grid.to_map(pixel), height, dtm, lean[section], base)
-    points = Points(*pixel.T, where[:, 0], where[:, 1], z, height, corners["sigma"].to_numpy()[corner])
+    sigma = corners["sigma"].to_numpy()[corner]
+    sums = heightmap.column(sections["sums"])
+    known = [heightmap.points(row) for row in sums] if rule == "robust" else [np.zeros((0, 4))] * len(sums)
+    cell = np.concatenate([np.zeros((0, 4)), *known])
+    inside = np.repeat(np.arange(len(known)), [len(k) for k in known])
+
+    def standing(pixel: np.ndarray, height: np.ndarray, sigma: np.ndarray, section: np.ndarray) -> Points:
+        where, z = view.ground_position(facts.grid.to_map(pixel), height, dtm, lean[section], base)
+        return Points(*pixel.T, *where.T, z, height, sigma)
+
+    points = standing(pixel, height, sigma, section)
+    cells = standing(cell[:, :2], cell[:, 2], cell[:, 3], inside)
+    count = np.arange(len(outlines) + 1)
+    parts, shown = (
+        [some.take(np.arange(first, end)) for first, end in pairwise(np.searchsorted(of, count))]
+        for some, of in ((points, section), (cells, inside))
+    )
     area_px = shapely.area(outlines)
-    rows = []
-    bounds = np.searchsorted(section, np.arange(len(outlines) + 1))
-    parts = [points.take(np.arange(first, end)) for first, end in pairwise(bounds)]
-    typical = np.array([np.median(p.height) if len(p.z) else fallback[0] for p in parts])
+    heights = [np.concatenate([p.height, c.height]) for p, c in zip(parts, shown, strict=True)]
+    typical = np.array([np.median(h) if len(h) else fallback[0] for h in heights])
     middle, _ = view.ground_position(centre, typical, dtm, lean, base)
     ground = dtm(middle)
     edge, void = sections["edge"].to_pylist(), sections["void"].to_pylist()
     outline, of = shapely.get_coordinates(outlines, return_index=True)
     seen = facts.grid.to_map(outline)
     projected = base(seen)
-    vertices = np.searchsorted(of, np.arange(len(outlines) + 1))
+    vertices = np.searchsorted(of, count)
+    rows = []
     for i, mine in enumerate(parts):
-        found = fit(mine, area_px[i], middle[i], ground[i], fallback, rule)
+        n = float(sums[i, 0]) if len(shown[i].z) else 0.0
+        of_map = Cells(shown[i], n, float(sums[i, -1]) / max(n, 1.0))
+        found = fit(mine, area_px[i], middle[i], ground[i], fallback, rule, of_map)
         own = slice(vertices[i], vertices[i + 1])
         rim = Rim(seen[own], projected[own], lean[i])
-        found = checked(found, mine, area_px[i], float(ground[i]), middle[i], rim, edge[i], void[i])
+        found = checked(found, heights[i], area_px[i], float(ground[i]), middle[i], rim, edge[i], void[i])
         rows.append([*found.plane, found.sigma, len(mine.z), found.status, found.reason])
     table = sections.select(["section_id", "outline", "score", "split"])
     for k, (name, kind) in enumerate(PLANE_FIELDS):

@@ -4,7 +4,7 @@ Each tile is shown to the model once; its outputs are decoded twice, by the same
 the files are those of the three steps it replaces. Tiles without data are not looked at.
 
 In: `tiles.tif`, the model (task `both`). Out: `sections.tif`, `pieces.parquet`, `links.parquet`, `seams.npz` (see `sections`) and
-`corners.parquet` (see `corners`).
+`corners.parquet`, `heights.parquet` (see `corners`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import argparse
 import numpy as np
 import pyarrow as pa
 
-from kibs_steps import cli, corners, raster, scene, sections, store
+from kibs_steps import cli, corners, heightmap, raster, scene, sections, store
 from kibs_steps.grid import Block, Grid, Tiling
 from kibs_steps.models import heads, runtime
 
@@ -27,18 +27,21 @@ def detect(
     grid: Grid,
     network: runtime.Network,
     contract: dict,
-) -> tuple[list[sections.View], pa.Table]:
-    """What every tile of a block image (core grown by the margin; rgb uint8, valid bool) sees, and all its corners."""
-    views, used, tables = [], 0, [corners.CORNERS.empty_table()]
+) -> tuple[list[sections.View], pa.Table, pa.Table]:
+    """What every tile of a block image (core grown by the margin; rgb uint8, valid bool) sees, all its corners and heights."""
+    views, used, tables, heights = [], 0, [corners.CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile, image, data in sections.tile_images(rgb, valid, tiling, block, grid):
-        found = None
+        found = outputs = None
         if sections.core_of(data, tile, tiling.margin).any():
             outputs = network(image)
             found = heads.decode_sections(outputs, contract)
             tables.append(corners.of_tile(heads.decode_corners(outputs, contract), tile, tiling))
         views.append(sections.view_of(tile, found, data, used))
+        if outputs is not None:
+            shown = heads.height_map(outputs, contract)
+            heights.append(corners.heights_of_tile(shown, views[-1].labels, tile, tiling))
         used += len(views[-1].scores)
-    return views, pa.concat_tables(tables)
+    return views, pa.concat_tables(tables), pa.concat_tables(heights)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -59,6 +62,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--links", required=True, help="out: links.parquet")
     parser.add_argument("--seams", required=True, help="out: seams.npz")
     parser.add_argument("--corners", required=True, help="out: corners.parquet")
+    parser.add_argument("--heights", required=True, help="out: heights.parquet")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     model = runtime.from_record(args.model, "both")
@@ -70,10 +74,11 @@ def main(argv: list[str] | None = None) -> None:
     seen = facts.view_of(core)
     geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry, args.provider, args.threads)
-    views, table = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
+    views, table, heights = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
     clear = valid & ~sections.burnt_out(rgb, valid, views, tiling, core)
     sections.write(views, clear, tiling, core, args.seam_rule, args)
     store.write_table(args.corners, table)
+    store.write_table(args.heights, heights)
 
 
 if __name__ == "__main__":

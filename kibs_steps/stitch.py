@@ -8,8 +8,8 @@ Union-find has no order, so results depend neither on the order of blocks nor on
 Which pieces belong together is found for the whole raster at once, from numbers alone. Outlines are joined in a **sweep** over
 the rows of blocks: a section leaves as soon as nothing below can touch it, so memory holds a row of blocks, not the city.
 
-In: all blocks' pieces, links, seams and corners. Out: `stitched/sections.parquet` (each section in the block that holds its id
-pixel) and `stitched/corners.parquet` (the corners within reach of each block's sections), both with a column `block`.
+In: all blocks' pieces, links, seams, corners and heights. Out: `stitched/sections.parquet` (each section in the block that holds
+its id pixel) and `stitched/corners.parquet` (the corners within reach of each block's sections), both with a column `block`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, scene, store
+from kibs_steps import cli, heightmap, scene, store
 from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Block, Grid, Tiling
 from kibs_steps.sections import SEAM_RULES, links_across
@@ -43,17 +43,19 @@ SECTIONS = pa.schema(
         ("edge", pa.bool_()),
         ("void", pa.bool_()),
         ("owner", pa.int64()),
+        ("sums", heightmap.HEIGHTS.field("sums").type),
     ]
 )
 
 
 class Detections(NamedTuple):
-    """How to read what was found in a block: its pieces (the columns asked for), links, seams, corners."""
+    """How to read what was found in a block: its pieces (the columns asked for), links, seams, corners, heights."""
 
     pieces: Callable[[Block, list[str]], pa.Table]
     links: Callable[[Block], pa.Table]
     seams: Callable[[Block], dict[str, np.ndarray]]
     corners: Callable[[Block], pa.Table]
+    heights: Callable[[Block], pa.Table]
 
 
 class Joined(NamedTuple):
@@ -75,7 +77,8 @@ class Joined(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Columns of outlines (px) on their way: piece number (or 0), group, geometry, score, void, split, owner."""
+    """Columns of outlines (px) on their way: piece number (or 0), group, geometry, score, void, split, owner,
+    sums of heights (n, 10)."""
 
     number: np.ndarray
     group: np.ndarray
@@ -84,6 +87,7 @@ class Parts(NamedTuple):
     void: np.ndarray
     split: np.ndarray
     owner: np.ndarray
+    sums: np.ndarray
 
     def take(self, rows: np.ndarray) -> Parts:
         """The chosen rows."""
@@ -95,7 +99,10 @@ class Parts(NamedTuple):
         return Parts(*(np.concatenate(columns) for columns in zip(*some, strict=True)))
 
 
-NOTHING = Parts(*(np.zeros(0, kind) for kind in (np.int64, np.int64, object, float, bool, np.int64, np.int64)))
+NOTHING = Parts(
+    *(np.zeros(0, kind) for kind in (np.int64, np.int64, object, float, bool, np.int64, np.int64)),
+    np.zeros((0, len(heightmap.SUMS))),
+)
 
 
 def groups(n: int, links: np.ndarray) -> np.ndarray:
@@ -157,7 +164,7 @@ def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
 def united(pieces: Parts) -> Parts:
     """Sections from pieces in order of number: the union of every group, then one section per connected part.
 
-    Scores are means weighted by area.
+    Scores are means weighted by area. Every part of a group has the sums of heights of the whole.
     """
     order = np.argsort(pieces.group, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(pieces.group[order]) != 0]) if len(order) else np.zeros(0, int)
@@ -167,14 +174,26 @@ def united(pieces: Parts) -> Parts:
         some = pieces.take(members)
         whole = some.geometry[0] if len(members) == 1 else shapely.union_all(some.geometry)
         score = float((area[members] / area[members].sum() * some.score).sum())
-        facts = score, bool(some.void.any()), int(some.split.max()), int(some.owner.max())
+        facts = score, bool(some.void.any()), int(some.split.max()), int(some.owner.max()), some.sums.sum(axis=0)
         rows += [(part, *facts) for part in shapely.get_parts(whole)]
     if not rows:
         return NOTHING
-    geometry, score, void, split, owner = zip(*rows, strict=True)
+    geometry, score, void, split, owner, sums = zip(*rows, strict=True)
     none = np.zeros(len(rows), np.int64)
     shapes = shapely.normalize(np.array(geometry, object))
-    return Parts(none, none, shapes, np.array(score), np.array(void), np.array(split), np.array(owner))
+    return Parts(none, none, shapes, *map(np.array, (score, void, split, owner, sums)))
+
+
+def of_pieces(labels: np.ndarray, heights: pa.Table) -> np.ndarray:
+    """Sums of heights (n, 10) of a block's pieces with these labels, zero for those without."""
+    sums = np.zeros((len(labels), len(heightmap.SUMS)))
+    if len(heights):
+        known = heights["label"].to_numpy()
+        order = np.argsort(known)
+        place = np.minimum(np.searchsorted(known, labels, sorter=order), len(known) - 1)
+        there = known[order[place]] == labels
+        sums[there] = heightmap.column(heights["sums"])[order[place[there]]]
+    return sums
 
 
 def section_ids(outlines: np.ndarray, grid: Grid) -> np.ndarray:
@@ -276,6 +295,7 @@ def finished(sections: Parts, grid: Grid, tolerance: float) -> pa.Table:
             smooth[members] = simplified(smooth[members], tolerance)
     edge = touches_edge(whole.geometry, grid)
     columns = [ids, shapely.to_wkb(smooth), whole.score, whole.split, edge, whole.void, whole.owner]
+    columns.append(heightmap.table(ids, whole.sums)["sums"].combine_chunks())
     return pa.table(columns, schema=SECTIONS)
 
 
@@ -297,7 +317,8 @@ def sweep(
                 table, number = found.pieces(block, FACTS), whole.number[block.name]
                 shapes = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False))
                 rest = [table[name].to_numpy(zero_copy_only=False) for name in FACTS[2:]]
-                pieces.append(Parts(number, whole.group[number], shapes, *rest).take(whole.stands[number]))
+                sums = of_pieces(table["label"].to_numpy(), found.heights(block))
+                pieces.append(Parts(number, whole.group[number], shapes, *rest, sums).take(whole.stands[number]))
         every = Parts.joined(pieces)
         every = every.take(np.argsort(every.number))
         ready = last[every.group] <= row
@@ -388,6 +409,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
     parser.add_argument("--without-corners", action="store_true", help="no corners were looked for")
+    parser.add_argument("--with-heights", action="store_true", help="a model gave heights all over the sections")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
     parser.add_argument("--corners", required=True, help="out: corners of all blocks")
     args = parser.parse_args(argv)
@@ -400,6 +422,11 @@ def main(argv: list[str] | None = None) -> None:
         seams=lambda b: store.read_arrays(folders[b.name] / "seams.npz"),
         corners=lambda b: (
             CORNERS.empty_table() if args.without_corners else store.read_table(folders[b.name] / "corners.parquet")
+        ),
+        heights=lambda b: (
+            store.read_table(folders[b.name] / "heights.parquet")
+            if args.with_heights
+            else heightmap.HEIGHTS.empty_table()
         ),
     )
     blocks = [tiling.block_of(name) for name in folders]

@@ -10,6 +10,7 @@ import toy_city
 
 from kibs_steps import edited, store
 from kibs_steps.corners import CORNERS
+from kibs_steps.heightmap import EMPTY
 from kibs_steps.stitch import SECTIONS, section_ids
 
 
@@ -28,6 +29,7 @@ def world(tmp_path):
         [False] * n,
         [True, False, False, False],
         [5, 6, 7, 8],
+        [EMPTY] * n,
     ]
     stitched = pa.table([pa.array(c, f.type) for c, f in zip(columns, SECTIONS, strict=True)], schema=SECTIONS)
     rows = [

@@ -7,7 +7,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kibs_steps import ground, planes, scene, view
+from kibs_steps import ground, heightmap, planes, scene, view
 from kibs_steps.grid import Grid
 from kibs_steps.terrain import Terrain
 
@@ -59,6 +59,7 @@ def fed(rings, facts, dtm):
             "edge": np.zeros(n, bool),
             "void": np.zeros(n, bool),
             "owner": np.arange(1, n + 1),
+            "sums": pa.array([heightmap.EMPTY] * n, heightmap.HEIGHTS.field("sums").type),
         }
     )
     columns = dict(

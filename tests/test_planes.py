@@ -34,6 +34,18 @@ def test_three_corners_give_their_plane(rule):
     np.testing.assert_allclose(found.plane[:3], level[:3], atol=2e-4)
 
 
+def test_the_height_map_gives_a_plane_without_corners():
+    cells = planes.Cells(on_plane(SQUARE), 30.0, 2.0)
+    none = points(np.zeros((0, 3)))
+    sharp = cells._replace(points=cells.points._replace(sigma=np.full(4, 0.05)))
+    found = planes.fit(none, 400.0, MIDDLE, 0.0, (6.11, 3.0), "robust", sharp)
+    assert found.status == "ok"
+    np.testing.assert_allclose(found.plane[:3], SLOPE[:3], atol=0.01)
+    assert found.sigma >= planes.COMMON * 2.0  # cells err together
+    assert planes.fit(none, 400.0, MIDDLE, 0.0, (6.11, 3.0), "paper", cells).status == "no_corners"
+    assert planes.fit(none, 400.0, MIDDLE, 0.0, (6.11, 3.0), "robust", cells._replace(n=1.0)).status == "no_corners"
+
+
 def test_one_wild_corner_is_outvoted():
     """Five corners on a plane and one 8 m too high: the robust plane stays within 0.2 m, plain least squares does not."""
     xy = np.vstack([SQUARE, [[0.0, 4.0], [0.0, -4.0]]])
@@ -169,7 +181,7 @@ RIM = planes.Rim(np.array([[0.0, 0.0], [8.0, 0.0], [8.0, 6.0], [0.0, 6.0]]), np.
 def test_statuses(change, status):
     found = planes.fit(on_plane(SQUARE), 80.0, MIDDLE, 0.0, (6.11, 3.0), "robust")
     arguments = {"area_px": 400.0, "ground": 0.0, "middle": MIDDLE, "rim": RIM, "edge": False, "void": False, **change}
-    result = planes.checked(found, on_plane(SQUARE), **arguments)
+    result = planes.checked(found, on_plane(SQUARE).height, **arguments)
     assert result.status == status
     assert bool(result.reason) == (status != "ok")
 
@@ -177,7 +189,7 @@ def test_statuses(change, status):
 @pytest.mark.parametrize(("height", "near"), [(-1086.0, 0.3), (0.2, 0.3), (900.0, planes.MAX_HEIGHT)])
 def test_implausible_height_is_made_level_at_the_nearest_plausible_one(height, near):
     absurd = planes.Fit(view.Plane(0.5, 0.0, height, *MIDDLE), 0.1, "ok", "")
-    result = planes.checked(absurd, on_plane(SQUARE), 400.0, 0.0, MIDDLE, RIM, False, False)
+    result = planes.checked(absurd, on_plane(SQUARE).height, 400.0, 0.0, MIDDLE, RIM, False, False)
     assert result.status == "implausible_height"
     assert (result.plane.a, result.plane.b) == (0, 0)
     assert result.plane.at(MIDDLE) == pytest.approx(near)
@@ -188,7 +200,7 @@ def test_implausible_height_is_made_level_at_the_nearest_plausible_one(height, n
 def test_implausible_slope_is_made_level(a, b, why):
     steep = view.Plane(a, b, 10.0, *MIDDLE)
     found = planes.Fit(steep, 0.1, "ok", "")
-    result = planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, RIM, False, False)
+    result = planes.checked(found, on_plane(SQUARE).height, 400.0, 0.0, MIDDLE, RIM, False, False)
     assert result.status == "implausible_slope"
     assert why in result.reason
     assert (result.plane.a, result.plane.b) == (0, 0)
@@ -198,7 +210,7 @@ def test_plane_that_dives_into_the_ground_is_made_level():
     """As steep as a roof may be, but over a section as long as no roof is steep."""
     long = planes.Rim(RIM.seen * [1.0, 20.0], RIM.base, RIM.lean)
     found = planes.Fit(view.Plane(0.0, -1.2, 8.0, *MIDDLE), 0.1, "ok", "")
-    result = planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, long, False, False)
+    result = planes.checked(found, on_plane(SQUARE).height, 400.0, 0.0, MIDDLE, long, False, False)
     assert result.status == "implausible_height"
     assert (result.plane.a, result.plane.b) == (0, 0)
-    assert planes.checked(found, on_plane(SQUARE), 400.0, 0.0, MIDDLE, RIM, False, False).status == "ok"
+    assert planes.checked(found, on_plane(SQUARE).height, 400.0, 0.0, MIDDLE, RIM, False, False).status == "ok"

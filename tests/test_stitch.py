@@ -8,7 +8,7 @@ import toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kibs_steps import corners, sections, stitch
+from kibs_steps import corners, heightmap, sections, stitch
 from kibs_steps.grid import Grid, Tiling, Window
 from kibs_steps.models import contract, heads, runtime
 
@@ -36,7 +36,7 @@ def detections(image, block_side, nets, shuffle=None, tolerance=0.0):
     blocks = tiling.blocks(grid.width, grid.height)
     if shuffle is not None:
         blocks = [blocks[i] for i in shuffle.permutation(len(blocks))]
-    pieces, links, seams, found = {}, {}, {}, {}
+    pieces, links, seams, found, heights = {}, {}, {}, {}, {}
     for block in blocks:
         core = tiling.block_core(block, grid.width, grid.height)
         grown = core.grown(toy.MARGIN)  # the padded image starts a margin before the raster
@@ -48,14 +48,17 @@ def detections(image, block_side, nets, shuffle=None, tolerance=0.0):
         links[block] = pa.table({"first": inner[:, 0], "second": inner[:, 1]})
         seams[block] = sections.seams(views, toy.MARGIN)
         network, terms = nets["corners"]
-        tables = []
+        tables, cells = [], [heightmap.HEIGHTS.empty_table()]
         for view in views:
             place = sections.window_in_block(tiling.window(view.tile), core, toy.MARGIN)
             rgb = sections.padded(padded[window], place)
-            tables.append(corners.of_tile(heads.decode_corners(network(rgb), terms), view.tile, tiling))
-        found[block] = pa.concat_tables(tables)
+            outputs = network(rgb)
+            tables.append(corners.of_tile(heads.decode_corners(outputs, terms), view.tile, tiling))
+            cells.append(corners.heights_of_tile(heads.height_map(outputs, terms), view.labels, view.tile, tiling))
+        found[block], heights[block] = pa.concat_tables(tables), pa.concat_tables(cells)
     read = stitch.Detections(
-        lambda b, columns: pieces[b].select(columns), links.__getitem__, seams.__getitem__, found.__getitem__
+        lambda b, columns: pieces[b].select(columns),
+        *(read.__getitem__ for read in (links, seams, found, heights)),
     )
     _, each, near = zip(*stitch.stitch(blocks, read, grid, tiling, tolerance, 3.0), strict=True)
     return pa.concat_tables(each).sort_by("section_id"), pa.concat_tables(near)
@@ -71,6 +74,17 @@ def test_every_painted_section_comes_back_once(world):
         box = shapely.box(col, row, col + w, row + h)
         iou = shapely.area(shapely.intersection(outlines, box)) / shapely.area(shapely.union(outlines, box))
         assert iou.max() > 1 - 6 / (w * h)
+
+
+def test_heights_of_pieces_add_up_to_those_of_the_section(world):
+    """Every cell of the height map counts once, for the section it lies in, on whichever side of a seam it was seen."""
+    image, _, nets = world
+    table, _ = detections(image, 2, nets)
+    sums = heightmap.column(table["sums"])
+    for box, row in zip(shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False)), sums, strict=True):
+        n, x, y = row[:3]
+        assert n == pytest.approx(box.area / heightmap.CELL)
+        assert [x / n, y / n] == pytest.approx([box.centroid.x, box.centroid.y], abs=0.5)
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1.5])

@@ -30,7 +30,7 @@ import shapely
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 
-from kibs_steps import buildings, features, ground, planes, scene, solids, stitch, store, truth, zbuffer
+from kibs_steps import buildings, features, ground, heightmap, planes, scene, solids, stitch, store, truth, zbuffer
 from kibs_steps.faces import MM
 from kibs_steps.grid import Grid, Window
 from kibs_steps.shells import ROOF
@@ -130,7 +130,7 @@ def disturbed(city: World, level: tuple[float, float, float], seed: int) -> tupl
 def _sections(outlines: np.ndarray, ids: np.ndarray, owned: bool = True) -> pa.Table:
     n = len(ids)
     columns = [ids, shapely.to_wkb(outlines), np.ones(n), np.full(n, 2), np.zeros(n, bool), np.zeros(n, bool)]
-    columns.append(ids if owned else np.zeros(n, np.int64))
+    columns += [ids if owned else np.zeros(n, np.int64), [heightmap.EMPTY] * n]
     return pa.table(
         [pa.array(c, f.type) for c, f in zip(columns, stitch.SECTIONS, strict=True)], schema=stitch.SECTIONS
     )

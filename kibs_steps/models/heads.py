@@ -232,6 +232,15 @@ def height_moments(distribution: np.ndarray, heights: dict[str, Any]) -> tuple[n
     return mean, np.sqrt(variance)
 
 
+def height_map(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean and σ (m, (rows, cols)) of every cell of a dense 3D model's height map; None for models without one."""
+    if contract["head"] != "dense":
+        return None
+    bins = outputs["height"]
+    mean, sigma = height_moments(bins.reshape(len(bins), -1), contract["heights"])
+    return mean.reshape(bins.shape[1:]), sigma.reshape(bins.shape[1:])
+
+
 def dense_corners(
     corner: np.ndarray, offset: np.ndarray, height: np.ndarray, heights: dict[str, Any], thresholds: dict[str, float]
 ) -> Corners:

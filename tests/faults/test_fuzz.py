@@ -10,13 +10,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import rasterio
+import rasterio.features
 import shapely
 import yaml
 from hypothesis import HealthCheck, given
 from hypothesis import settings as rules
 from hypothesis import strategies as st
 
-from kibs_steps import buildings, gate, ground, planes, scene, sections, solids, stitch, terrain, tiles
+from kibs_steps import buildings, gate, ground, heightmap, planes, scene, sections, solids, stitch, terrain, tiles
 from kibs_steps import plan as plans
 from kibs_steps.corners import CORNERS
 from kibs_steps.errors import KibsError
@@ -132,8 +133,21 @@ def tables(labels: np.ndarray, rng: np.random.Generator) -> tuple[pa.Table, pa.T
     )
     height = rng.choice([rng.uniform(2, 12, len(where)), rng.uniform(-5, 300, len(where))], p=[0.85, 0.15])
     m, flags = len(where), rng.random((2, n)) < 0.05
+    # Half of the maps with heights all over the sections, of the same wild kind.
+    cells = np.zeros((n, len(heightmap.SUMS)))
+    if rng.random() < 0.5 and n:
+        labels = np.zeros((SIDE, SIDE), np.int64)
+        for k, part in enumerate(whole, start=1):
+            burnt = rasterio.features.rasterize([part], (SIDE, SIDE))
+            labels[burnt > 0] = k
+        mean = rng.choice([rng.uniform(2, 12), rng.uniform(-5, 300)], p=[0.9, 0.1]) + rng.normal(
+            0, 1, (SIDE // 4, SIDE // 4)
+        )
+        known, found = heightmap.sums_by_label(labels, mean, rng.uniform(0.1, 3, mean.shape), 0.0, 0.0)
+        cells[known - 1] = found
+    sums = heightmap.table(ids, cells)["sums"]
     table = pa.table(
-        [ids, shapely.to_wkb(smooth), np.full(n, 0.9), np.full(n, 2), *flags, np.zeros(n, np.int64)],
+        [ids, shapely.to_wkb(smooth), np.full(n, 0.9), np.full(n, 2), *flags, np.zeros(n, np.int64), sums],
         schema=stitch.SECTIONS,
     )
     columns = [np.zeros(m, np.int64), np.zeros(m, np.int64), where[:, 0], where[:, 1], height]

@@ -149,9 +149,15 @@ def found_corners(wildcards):
     return blocks(f"{source(wildcards)}/corners.parquet")(wildcards)
 
 
+def mapped(p):
+    """Whether a 3D model gives heights all over the sections, besides corners."""
+    return p.settings["feed"] == "models" and not measured(p)
+
+
 def detections(wildcards):
-    """What `stitch` joins: four files of every block, or three without corners."""
-    files = ("pieces.parquet", "links.parquet", "seams.npz")
+    """What `stitch` joins: files of every block, with corners and heights where models found them."""
+    files = ["pieces.parquet", "links.parquet", "seams.npz"]
+    files += ["heights.parquet"] if mapped(plan(wildcards)) else []
     return [
         *(
             f

@@ -71,7 +71,11 @@ rule blend:
         " --block {params.tiling.block} --out {output:q} > {log:q} 2>&1"
 
 
-given = inputs("corners", "results/{scene}/blocks/{block}/detected/corners.parquet")
+given = inputs(
+    "corners",
+    "results/{scene}/blocks/{block}/detected/corners.parquet",
+    "results/{scene}/blocks/{block}/detected/heights.parquet",
+)
 
 
 rule corners:
@@ -79,9 +83,11 @@ rule corners:
     input:
         scene=given("results/{scene}/scene.json"),
         blended=given("results/{scene}/blocks/{block}/blended.tif"),
+        labels=given("results/{scene}/blocks/{block}/sections.tif"),
         model=given("results/{scene}/models/corners.json"),
     output:
-        "results/{scene}/blocks/{block}/detected/corners.parquet",
+        corners="results/{scene}/blocks/{block}/detected/corners.parquet",
+        heights="results/{scene}/blocks/{block}/detected/heights.parquet",
     log:
         "results/{scene}/logs/corners/{block}.log",
     benchmark:
@@ -98,8 +104,9 @@ rule corners:
         tiling=lambda w: plan(w).tiling,
         options=options("provider", "threads"),
     shell:
-        "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q} --out {output:q} > {log:q} 2>&1"
+        "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --labels {input.labels:q}"
+        " --model {input.model:q} --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
+        " {params.options:q} --out {output.corners:q} --heights {output.heights:q} > {log:q} 2>&1"
 
 
 given = inputs(
@@ -109,6 +116,7 @@ given = inputs(
     "results/{scene}/blocks/{block}/detected/links.parquet",
     "results/{scene}/blocks/{block}/detected/seams.npz",
     "results/{scene}/blocks/{block}/detected/corners.parquet",
+    "results/{scene}/blocks/{block}/detected/heights.parquet",
 )
 
 
@@ -124,6 +132,7 @@ rule single:
         links="results/{scene}/blocks/{block}/detected/links.parquet",
         seams="results/{scene}/blocks/{block}/detected/seams.npz",
         corners="results/{scene}/blocks/{block}/detected/corners.parquet",
+        heights="results/{scene}/blocks/{block}/detected/heights.parquet",
     log:
         "results/{scene}/logs/single/{block}.log",
     benchmark:
@@ -144,7 +153,7 @@ rule single:
         "python -m kibs_steps.single --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
         " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
-        " --links {output.links:q} --seams {output.seams:q} --corners {output.corners:q} > {log:q} 2>&1"
+        " --links {output.links:q} --seams {output.seams:q} --corners {output.corners:q} --heights {output.heights:q} > {log:q} 2>&1"
 
 
 given = inputs("truth", "results/{scene}/truth.parquet")
@@ -239,7 +248,8 @@ rule stitch:
             f"results/{w.scene}/blocks/{b.name}/{source(w)}"
             for b in plan(w).having("feed")
         ],
-        corners=lambda w: ["--without-corners"] if measured(plan(w)) else [],
+        corners=lambda w: (["--without-corners"] if measured(plan(w)) else [])
+        + (["--with-heights"] if mapped(plan(w)) else []),
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"

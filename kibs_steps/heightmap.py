@@ -1,0 +1,78 @@
+"""Height map: what the 3D model says of the heights all over a section, as sums that fix a plane.
+
+Corners alone leave many a section without a plane, and each carries the whole error of one place. A dense 3D model also gives the
+height of every cell of its map, so every piece of a section takes along the sums of least squares over its cells, in image
+coordinates (px) and metres above ground. Sums of pieces add up to those of their section exactly, whatever tiles and blocks
+they come from. `points` turns a section's sums into four points with heights that any fit of a plane can use beside corners.
+
+Most of a cell's error is that of the whole section; only `LOCAL` of its σ tells cells apart, and so bounds slopes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+SUMS = ("n", "x", "y", "h", "xx", "xy", "yy", "xh", "yh", "sigma")  # of cells: number, col, row, height, products, σ
+CELL = 16.0  # px²: what counts as one cell, whatever the map's stride
+EMPTY = [0.0] * len(SUMS)  # no cells
+LOCAL = 0.3
+FLATTEST = 0.04  # px²: spread of the cells of a piece one cell wide
+
+HEIGHTS = pa.schema([("label", pa.int64()), ("sums", pa.list_(pa.float64(), len(SUMS)))])
+
+
+def cells_of(labels: NDArray, stride: int) -> NDArray:
+    """Label (rows, cols) of each cell: that of the pixel right below its middle."""
+    return labels[stride // 2 :: stride, stride // 2 :: stride]
+
+
+def sums_by_label(
+    labels: NDArray, mean: NDArray, sigma: NDArray, col: float, row: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The labels above 0 among cells (rows, cols) and their sums (n, 10).
+
+    `mean` and `sigma` (m above ground) are the height map's cells; the tile's upper left corner lies at (`col`, `row`) px of the
+    image, `labels` (s, s) are its pixels, 0 where the tile has no say.
+    """
+    stride = labels.shape[0] // mean.shape[0]
+    label = cells_of(labels, stride)[: mean.shape[0], : mean.shape[1]]
+    i, j = np.nonzero(label)
+    found, at = np.unique(label[i, j], return_inverse=True)
+    x, y = col + (j + 0.5) * stride, row + (i + 0.5) * stride
+    h, s = mean[i, j].astype(np.float64), sigma[i, j].astype(np.float64)
+    terms = (np.ones(len(h)), x, y, h, x * x, x * y, y * y, x * h, y * h, s)
+    sums = np.stack([np.bincount(at, term, len(found)) for term in terms], axis=1).reshape(-1, len(SUMS))
+    return found.astype(np.int64), sums * (stride**2 / CELL)
+
+
+def table(labels: NDArray[np.int64], sums: NDArray[np.float64]) -> pa.Table:
+    """Rows after `HEIGHTS`."""
+    flat = pa.array(np.ascontiguousarray(sums).ravel(), pa.float64())
+    return pa.table([labels, pa.FixedSizeListArray.from_arrays(flat, len(SUMS))], schema=HEIGHTS)
+
+
+def column(sums: pa.ChunkedArray) -> NDArray[np.float64]:
+    """A column of sums as an array (n, 10)."""
+    parts = [part.flatten().to_numpy(zero_copy_only=False) for part in sums.chunks]
+    return np.concatenate([*parts, np.zeros(0)]).reshape(-1, len(SUMS))
+
+
+def points(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Four points (4, 4: col, row px, height, σ m) that fix the same plane as a section's cells; none (0, 4) without cells.
+
+    They lie on the cells' principal axes, so their least squares plane is that of the cells wherever σ is one.
+    """
+    n, x, y, h, xx, xy, yy, xh, yh, sigma = sums
+    if n <= 0:
+        return np.zeros((0, 4))
+    middle = np.array([x, y]) / n
+    spread = np.array([[xx, xy], [xy, yy]]) / n - np.outer(middle, middle)
+    with_height = np.array([xh, yh]) / n - middle * (h / n)
+    width, axes = np.linalg.eigh(spread)
+    gradient = axes @ np.where(width > FLATTEST, axes.T @ with_height / np.maximum(width, FLATTEST), 0.0)
+    arms = np.sqrt(2 * np.maximum(width, 0.0))[:, None] * axes.T
+    away = np.concatenate([arms, -arms])
+    each = LOCAL * sigma / n * np.sqrt(4 / n)
+    return np.column_stack([middle + away, h / n + away @ gradient, np.full(4, each)])
