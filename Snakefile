@@ -84,6 +84,7 @@ rule verify:
     """Compare all files of every scene with their checksums, and take away what must be made again."""
     log:
         "results/verify.log",
+    retries: 0
     conda:
         RUN
     params:
@@ -97,6 +98,7 @@ rule check:
     """Say what a run would do, how long it would take, and what is doubtful about the inputs."""
     log:
         "results/check.log",
+    retries: 0
     conda:
         RUN
     params:
