@@ -129,7 +129,8 @@ def write_by_block(path: str | Path, tables: dict[str, pa.Table]) -> None:
 def read_table(path: str | Path, columns: list[str] | None = None, block: str | None = None) -> pa.Table:
     """Read a Parquet table, or one block's rows of it (without the column `block`); damage raises `DamagedFile`.
 
-    By `ParquetFile`: `pyarrow.parquet.read_table` imports pyarrow's data sets, and with them pandas.
+    By `ParquetFile`: `pyarrow.parquet.read_table` imports pyarrow's data sets, and with them pandas. Without threads: blocks run
+    beside each other anyway, and a short step that ends while its pool still starts is aborted.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -138,11 +139,15 @@ def read_table(path: str | Path, columns: list[str] | None = None, block: str | 
         try:
             with pq.ParquetFile(file) as source:
                 if block is None:
-                    return source.read(columns)
+                    return source.read(columns, use_threads=False)
                 key = source.schema_arrow.names.index("block")
                 facts = [source.metadata.row_group(i) for i in range(source.num_row_groups)]
                 mine = [i for i, g in enumerate(facts) if g.num_rows and g.column(key).statistics.min == block]
-                table = source.read_row_groups(mine, columns) if mine else source.schema_arrow.empty_table()
+                table = (
+                    source.read_row_groups(mine, columns, use_threads=False)
+                    if mine
+                    else source.schema_arrow.empty_table()
+                )
                 kept = [name for name in columns or table.column_names if name != "block"]
                 return table.select(kept)
         except (pa.ArrowInvalid, OSError) as error:
@@ -177,7 +182,7 @@ def merged(paths: list[str] | list[Path], order: list[str], columns: list[str] |
     for k, (_, path, i) in enumerate(groups):
         with sums.opened(path) as file:
             try:
-                rows = pq.ParquetFile(file).read_row_group(i, columns)
+                rows = pq.ParquetFile(file).read_row_group(i, columns, use_threads=False)
             except (pa.ArrowInvalid, OSError) as error:
                 raise sums.damaged(path, error) from error
         held = pa.concat_tables([held, rows], promote_options="permissive")

@@ -9,17 +9,19 @@ import pyogrio
 import pytest
 import rasterio
 import toy
-from test_workflow import command, digests, jobs, run, world
+from test_workflow import MAIN, command, digests, jobs, run, world
+
+NEEDED = [*MAIN, "run.json"]
 
 
 @pytest.fixture(scope="session")
 def towns(tmp_path_factory):
     """One town by two models, and by one model that does both."""
     two = world(tmp_path_factory.mktemp("two"))
-    run(two)
+    run(two, only=NEEDED)
     one = world(tmp_path_factory.mktemp("one"))
     toy.both_model(one / "models/both.onnx")
-    return two, one, run(one, method="single")
+    return two, one, run(one, method="single", only=NEEDED)
 
 
 def test_one_model_gives_what_two_give(towns):
@@ -27,7 +29,7 @@ def test_one_model_gives_what_two_give(towns):
     done = jobs(output)
     assert not {"sections", "blend", "corners"} & set(done)
     assert done["single"] == done["tiles"]
-    assert digests(one)["points.txt"] == digests(two)["points.txt"]
+    assert digests(one, files=["points.txt"]) == digests(two, files=["points.txt"])
     for layer in ("roof_sections", "roof_sections_image", "buildings", "corners"):
         frames = [pyogrio.read_dataframe(f / "results/town/city.gpkg", layer=layer) for f in (one, two)]
         assert len(frames[0]) > 0
@@ -39,7 +41,7 @@ def test_one_model_gives_what_two_give(towns):
         ):
             np.testing.assert_array_equal(first.read(), second.read())
     assert "both.onnx" in (one / "results/town/run.json").read_text()
-    assert jobs(run(one, method="single")) == {}
+    assert jobs(run(one, method="single", only=NEEDED)) == {}
 
 
 def test_methods_of_two_scenes_in_one_run(tmp_path):
@@ -49,10 +51,12 @@ def test_methods_of_two_scenes_in_one_run(tmp_path):
     config = {"scenes": {"a": {**scene, "method": "single"}, "a.b": {**scene, "method": "two_stage"}}}
     (folder / "config.yaml").write_text(json.dumps(config))
     plain = command(folder)
-    done = jobs(run_command(folder, plain[: plain.index("--config")]))
+    files = [f"results/{name}/points.txt" for name in ("a", "a.b")]
+    done = jobs(run_command(folder, [*plain[: plain.index("--cores")], *files, "--cores", "2"]))
     assert done["single"] == 1
     assert done["sections"] == done["corners"] == 1
-    assert digests(folder, "a")["points.txt"] == digests(folder, "a.b")["points.txt"]
+    points = ["points.txt"]
+    assert digests(folder, "a", points) == digests(folder, "a.b", points)
 
 
 def run_command(folder, words):
@@ -67,7 +71,7 @@ def test_paper_mode_is_one_switch(towns, tmp_path):
     """Stride s − p, planes by the paper's rule, the picture with its codes: the same sections where tiles see them whole."""
     two = towns[0]
     folder = world(tmp_path)
-    run(folder, mode="paper", planes="robust")
+    run(folder, mode="paper", planes="robust", only=[*NEEDED, "paper.tif"])
     record = json.loads((folder / "results/town/run.json").read_text())
     assert record["settings"]["planes"] == "paper"
     stack = [len(list((f / "results/town/blocks").iterdir())) for f in (folder, two)]
@@ -97,9 +101,9 @@ def test_the_scene_chooses_from_a_suite(tmp_path):
         terms = {"trained_on": {"data": [name], "licence": f"licence of {name}", "view_elevation": elevations}}
         toy.sections_model(folder / "suite" / name / "sections.onnx", toy.contract("sections", **terms))
         toy.corners_model(folder / "suite" / name / "corners.onnx", toy.contract("corners", **terms))
-    output = run(folder, models="suite", block=4)
+    output = run(folder, models="suite", block=4, only=["run.json"])
     assert "licence of oblique" in output
     assert "licence of steep" not in output
     assert "suite/oblique/sections.onnx" in (folder / "results/town/run.json").read_text()
-    done = jobs(run(folder, models="suite", block=4, view_elevation=80))
+    done = jobs(run(folder, models="suite", block=4, view_elevation=80, only=["run.json"]))
     assert {"sections", "corners"} <= set(done)

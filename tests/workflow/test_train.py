@@ -64,7 +64,7 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
 
     other = {**scene, **{key: scene[key].replace("known", "new") for key in ("raster", "dtm", "truth")}}
     given = [f"{k}={v}" for k, v in {**other, "scene": "new", "models": "models/town", "method": "single"}.items()]
-    snakemake(tmp_path, "--config", *given)
+    snakemake(tmp_path, "results/new/city.gpkg", "results/new/evaluation.json", "--config", *given)
     assert (tmp_path / "results/new/evaluation.json").is_file()
     assert {"roof_sections", "buildings"} <= {
         name for name, _ in pyogrio.list_layers(tmp_path / "results/new/city.gpkg")

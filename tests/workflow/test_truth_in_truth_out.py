@@ -25,7 +25,17 @@ def test_truth_in_truth_out(tmp_path, slope):
     config = {"scenes": {"s": {"simulate": simulated, **ANGLES}}, "feed": "truth", "models": "models", "block": 4}
     (tmp_path / "config.yaml").write_text(json.dumps(config))
     done = subprocess.run(
-        [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", "2"],
+        [
+            sys.executable,
+            "-m",
+            "snakemake",
+            "-s",
+            str(ROOT / "Snakefile"),
+            "--cores",
+            "2",
+            "results/s/city.gpkg",
+            "results/s/evaluation.json",
+        ],
         cwd=tmp_path,
         capture_output=True,
         text=True,
