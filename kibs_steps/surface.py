@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, dtm, imagery, scene, view
+from kibs_steps import cli, dtm, heightmap, imagery, scene, view
 from kibs_steps.corners import CORNERS
 from kibs_steps.planes import map_bounds, middle_of
 from kibs_steps.terrain import Terrain
@@ -65,7 +65,7 @@ def points_in(outline: shapely.Geometry) -> np.ndarray:
 def measured(
     sections: pa.Table, facts: scene.Scene, surface: Terrain, terrain: view.Surface
 ) -> tuple[pa.Table, pa.Table]:
-    """Sections that own their points, and the points as a table after `corners.CORNERS`."""
+    """Sections that own their points and have no heights but theirs, and the points as a table after `corners.CORNERS`."""
     outlines = shapely.from_wkb(sections["outline"].to_numpy(zero_copy_only=False))
     ids = sections["section_id"].to_numpy()
     every = [points_in(outline) for outline in outlines]
@@ -79,8 +79,10 @@ def measured(
     n = len(pixel)
     none = np.zeros(n, np.int64)
     columns = [none, none, pixel[:, 0], pixel[:, 1], height, np.full(n, SIGMA), np.ones(n), ids[owner]]
-    place = sections.column_names.index("owner")
-    return sections.set_column(place, "owner", pa.array(ids, pa.int64())), pa.table(columns, schema=CORNERS)
+    sums = pa.array([heightmap.EMPTY] * len(ids), heightmap.HEIGHTS.field("sums").type)
+    for name, column in (("owner", pa.array(ids, pa.int64())), ("sums", sums)):
+        sections = sections.set_column(sections.column_names.index(name), name, column)
+    return sections, pa.table(columns, schema=CORNERS)
 
 
 def under(sections: pa.Table, facts: scene.Scene, path: str | Path, terrain: view.Surface) -> tuple[pa.Table, pa.Table]:
