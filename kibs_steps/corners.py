@@ -87,11 +87,11 @@ def main(argv: list[str] | None = None) -> None:
     tiling = Tiling(model.contract["tile"], args.margin, args.block)
     block = tiling.block_of(args.name)
     tiles = tiling.tiles(block, facts.grid.width, facts.grid.height)
+    labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
     images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
     seen = facts.view_of(tiling.block_core(block, facts.grid.width, facts.grid.height))
     geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
     network = runtime.open_network(model, geometry, args.provider, args.threads)
-    labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
     tables, heights = [CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile in tiles:
         place = tile.row, tile.col

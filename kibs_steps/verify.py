@@ -8,6 +8,7 @@ again; a published file is set aside as NAME.changed, because a user may have ed
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -76,8 +77,8 @@ def main(argv: list[str] | None = None) -> None:
     lines, total = [], 0
     for folder in map(Path, args.folders):
         found, read = findings(folder, args.temporary) if folder.is_dir() else ([], 0)
-        for leftover in folder.rglob(".tmp-*"):
-            leftover.unlink()
+        for leftover in list(folder.rglob(".tmp-*")):
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         mend(found, folder)
         lines += [f"  {path}: {what}" for path, what in found]
         total += read

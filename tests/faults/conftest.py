@@ -67,7 +67,7 @@ class Town(NamedTuple):
             and ".sums" not in p.parts
             and p.suffix != ".changed"
             and not p.name.endswith(".aux.xml")  # GDAL's, left by whoever reads a layer
-            and not p.name.startswith(".tmp-")
+            and not any(part.startswith(".tmp-") for part in p.parts)  # left by a killed step, read by none
         }
 
     def fault(self, **what: str) -> None:

@@ -132,8 +132,12 @@ def test_verify_takes_away_and_the_run_makes_again(undisturbed, copy, monkeypatc
             wrong |= set(damage(path, KINDS[k % len(KINDS)], rng, [f for f in files if f not in wrong]))
     for name in ("city.gpkg", "heights.tif"):
         wrong |= set(damage(Path("results/town", name), "flip", rng, []))
+    Path("results/town/.tmp-left").mkdir()  # of a step that was killed
+    for name in (".tmp-left/plain.tif", "blocks/r000c000/.tmp-left"):
+        Path("results/town", name).touch()
     done = copy.run("verify")
     assert done.returncode != 0
+    assert not list(Path("results/town").rglob(".tmp-*"))
     last = done.stderr.strip().split("\n")[-1]
     assert last.startswith(f"error: verify: {len(wrong)} of "), done.stdout + done.stderr
     assert "start snakemake as before, without verify" in last
