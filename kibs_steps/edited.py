@@ -97,7 +97,7 @@ def edited(
 ) -> tuple[pa.Table, pa.Table]:
     """Sections after `stitch.SECTIONS`, by id, and the corners; `before` is what was stitched.
 
-    Corners that belonged to a section that was touched are free again.
+    Corners that belonged to a section that was touched are free again, and the height map's sums over its old outline are gone.
     """
     row_of = {section: k for k, section in enumerate(before["section_id"].to_pylist())}
     old = shapely.from_wkb(before["outline"].to_numpy(zero_copy_only=False))
@@ -119,7 +119,7 @@ def edited(
         found = {"section_id": int(ids[k]), "outline": shapely.to_wkb(outlines[k]), "score": 1.0, "split": 2}
         found |= {"edge": bool(edge[k]), "void": False, "owner": 0, "sums": EMPTY}
         if row is not None:
-            found |= {name: column[name][row] for name in ("score", "split", "void", "sums")}
+            found |= {name: column[name][row] for name in ("score", "split", "void")}
         if not touched[k]:
             found = {name: column[name][row] for name in SECTIONS.names}
         for name, value in found.items():

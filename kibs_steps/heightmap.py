@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 SUMS = ("n", "x", "y", "h", "xx", "xy", "yy", "xh", "yh", "sigma")  # of cells: number, col, row, height, products, σ
 CELL = 16.0  # px²: what counts as one cell, whatever the map's stride
 EMPTY = [0.0] * len(SUMS)  # no cells
-LOCAL = 0.3
+LOCAL = 0.3  # tried on the demo: slopes are as little too flat as corners and cells together allow
 FLATTEST = 0.04  # px²: spread of the cells of a piece one cell wide
 
 HEIGHTS = pa.schema([("label", pa.int64()), ("sums", pa.list_(pa.float64(), len(SUMS)))])

@@ -1,12 +1,16 @@
-"""Small rasters for tests, written to disk: any driver, CRS, type; a smooth picture whose colours tell where a pixel is."""
+"""Small rasters for tests, written to disk: any driver, CRS, type; a smooth picture whose colours tell where a pixel is; the
+scene made of one."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import rasterio
 from affine import Affine
+
+from kibs_steps import scene
 
 X0, Y0 = 500_000.0, 5_400_000.0
 
@@ -54,3 +58,9 @@ def dtm(
 ) -> Path:
     """Write a terrain raster (rows, cols) whose upper-left corner is (x0, y0)."""
     return write(path, heights[None], crs, transform=Affine(step, 0.0, x0, 0.0, -step, y0), **profile)
+
+
+def build(folder: Path, raster: Path, ground: str = "0", gsd: float = 0.38, **options) -> tuple[scene.Scene, dict]:
+    """The scene of a raster and its terrain, and the JSON written for it."""
+    made = scene.build("toy", raster, ground, gsd, folder / "out", **options)
+    return made, json.loads((folder / "out/scene.json").read_text())

@@ -9,7 +9,7 @@ import pyogrio
 import pytest
 import rasterio
 import toy
-from test_workflow import MAIN, command, digests, jobs, run, world
+from test_workflow import MAIN, SNAKEMAKE, digests, finished, jobs, run, world
 
 NEEDED = [*MAIN, "run.json"]
 
@@ -50,21 +50,12 @@ def test_methods_of_two_scenes_in_one_run(tmp_path):
     scene = {"raster": "town.tif", "dtm": 100, "models": "models", "block": 4, **toy.VIEW}
     config = {"scenes": {"a": {**scene, "method": "single"}, "a.b": {**scene, "method": "two_stage"}}}
     (folder / "config.yaml").write_text(json.dumps(config))
-    plain = command(folder)
     files = [f"results/{name}/points.txt" for name in ("a", "a.b")]
-    done = jobs(run_command(folder, [*plain[: plain.index("--cores")], *files, "--cores", "2"]))
+    done = jobs(finished(folder, [*SNAKEMAKE, *files, "--cores", "2"]))
     assert done["single"] == 1
     assert done["sections"] == done["corners"] == 1
     points = ["points.txt"]
     assert digests(folder, "a", points) == digests(folder, "a.b", points)
-
-
-def run_command(folder, words):
-    import subprocess
-
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-5000:]
-    return done.stdout + done.stderr
 
 
 def test_paper_mode_is_one_switch(towns, tmp_path):

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pyogrio
 import pytest
 import shapely
 import toy
+from test_workflow import SNAKEMAKE, finished
 
-ROOT = Path(__file__).parents[2]
 ANGLES = {"view_azimuth": 181.1, "view_elevation": 59.3, "sun_azimuth": 155.0, "sun_elevation": 45.0}
 
 
@@ -24,23 +21,7 @@ def test_truth_in_truth_out(tmp_path, slope):
     simulated = {"seed": 4, "size": 420, "gsd": 0.38, "style": "suburb", "relief": 0.0, "slope": slope}
     config = {"scenes": {"s": {"simulate": simulated, **ANGLES}}, "feed": "truth", "models": "models", "block": 4}
     (tmp_path / "config.yaml").write_text(json.dumps(config))
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "snakemake",
-            "-s",
-            str(ROOT / "Snakefile"),
-            "--cores",
-            "2",
-            "results/s/city.gpkg",
-            "results/s/evaluation.json",
-        ],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-5000:]
+    finished(tmp_path, [*SNAKEMAKE, "results/s/city.gpkg", "results/s/evaluation.json", "--cores", "2"])
     folder = tmp_path / "results/s"
     for layer, truth_layer, tolerance in (
         ("roof_sections", "sections_map", 0.05),

@@ -21,6 +21,7 @@ import rasterio
 import toy
 
 ROOT = Path(__file__).parents[2]
+SNAKEMAKE = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile")]
 PUBLISHED = [
     "city.gpkg",
     "city.city.json",
@@ -47,26 +48,19 @@ def command(folder: Path, cores: int = 2, only: Sequence[str] = (), **settings: 
     """The user's command, run from a folder of their own; `only` some of the published files."""
     base = {"scene": "town", "raster": "town.tif", "dtm": 100, "models": "models", "block": 2, **toy.VIEW, **settings}
     config = [f"{k}={v}" for k, v in base.items()]
-    return [
-        sys.executable,
-        "-m",
-        "snakemake",
-        "-s",
-        str(ROOT / "Snakefile"),
-        *(f"results/town/{name}" for name in only),
-        "--cores",
-        str(cores),
-        "--config",
-        *config,
-    ]
+    return [*SNAKEMAKE, *(f"results/town/{name}" for name in only), "--cores", str(cores), "--config", *config]
+
+
+def finished(folder: Path, words: Sequence[str]) -> str:
+    """What a command that ends well printed."""
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-5000:]
+    return done.stdout + done.stderr
 
 
 def run(folder: Path, *flags: str, cores: int = 2, only: Sequence[str] = (), **settings: object) -> str:
     """Run the workflow to its end and return what it printed."""
-    words = [*command(folder, cores, only, **settings), *flags]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-5000:]
-    return done.stdout + done.stderr
+    return finished(folder, [*command(folder, cores, only, **settings), *flags])
 
 
 def jobs(output: str) -> dict[str, int]:
