@@ -1,7 +1,7 @@
 """Corners: every roof corner of a block with its height above ground, by the 3D model on the blended tiles.
 
 A tile answers for the corners in its core; those up to `SEAM` px beyond are kept too, because two tiles may each place a
-corner on the seam just across it. `stitch` keeps one of the two.
+corner on the seam just across it. `stitch` keeps one of the two. Where no section was found the model is not run.
 
 In: `blended.tif`, `sections.tif`, the model. Out: `corners.parquet`: tile, position (px, image coordinates), height and σ (m),
 score; `heights.parquet`: what the model's height map says of every piece of a section (`heightmap`).
@@ -95,6 +95,8 @@ def main(argv: list[str] | None = None) -> None:
     tables, heights = [CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile in tiles:
         place = tile.row, tile.col
+        if not labels[place].any():
+            continue  # no section is near that could take its corners
         outputs = network(images[place])
         tables.append(of_tile(heads.decode_corners(outputs, model.contract), tile, tiling))
         heights.append(heights_of_tile(heads.height_map(outputs, model.contract), labels[place], tile, tiling))

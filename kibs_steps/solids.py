@@ -1,11 +1,11 @@
 """Solids: every building as a closed solid on the ground, or the best simpler one that is valid, with the reason.
 
-In: the block's rows of `buildings.parquet`, the DTM. Out: CityJSONSeq (a header line, then one feature per building) and
-`solids.parquet`, the building attributes. Buildings that touch (a cluster) are tiled as one, so their party walls are the same
-faces; then each is made by itself. It is tried as a roof of fused planes (LOD2), then with roofs that dive into the ground cut
-there, then with every section flat
-at its mean height (1.3), then as one flat block (1.2); the first whose shells all pass `gate.check` is published, and
-`lod_reason` says what was refused before it. Where none passes the building stays, LOD "0", as its footprint.
+In: the block's rows of `buildings.parquet`, the DTM. Out: CityJSONSeq (a header line, then one feature per building),
+`solids.parquet`, the building attributes, and the solids' triangles (`mesh`). Buildings that touch (a cluster) are tiled as one,
+so their party walls are the same faces; then each is made by itself. It is tried as a roof of fused planes (LOD2), then with
+roofs that dive into the ground cut there, then with every section flat at its mean height (1.3), then as one flat block (1.2);
+the first whose shells all pass `gate.check` is published, and `lod_reason` says what was refused before it. Where
+none passes the building stays, LOD "0", as its footprint.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, clip, features, gate, scene, shells, store, straight
+from kibs_steps import cli, clip, features, gate, mesh, scene, shells, store, straight
 from kibs_steps.buildings import hidden
 from kibs_steps.errors import KibsError
 from kibs_steps.faces import MM, Face, NoPartition, Point, directed_edges, dissolved, shapes_of
@@ -366,6 +366,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--lod-label", default="2.0", help="what the most detailed level is called")
     parser.add_argument("--out", required=True, help="out: solids.city.jsonl")
     parser.add_argument("--attributes", required=True, help="out: solids.parquet")
+    parser.add_argument("--meshes", required=True, help="out: meshes.parquet")
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     grid = facts.grid
@@ -381,7 +382,7 @@ def main(argv: list[str] | None = None) -> None:
     for building, sections in clusters:
         gap = max(GAP, hidden(np.array([lean[k] for k in sections.ids.tolist()])))
         built += together(sections, building, dtm, args.lod_label, gap, RAGGED * grid.gsd)
-    rows = []
+    rows, triangles = [], []
     with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
         out.write(json.dumps(features.header(datum), separators=(",", ":")) + "\n")
         for building, sections, solid in sorted(built, key=lambda one: one.building):
@@ -389,7 +390,9 @@ def main(argv: list[str] | None = None) -> None:
             line = features.feature(row, sections, solid, datum, convergence)
             out.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")
             rows.append({**row, **{name: shapely.to_wkb(row[name]) for name in ("outline", "footprint")}})
+            triangles.append(mesh.row_of(line, (*datum, 0)))
     store.write_table(args.attributes, pa.Table.from_pylist(rows, features.ATTRIBUTES))
+    store.write_table(args.meshes, mesh.table([row for row in triangles if row]))
 
 
 if __name__ == "__main__":

@@ -367,9 +367,8 @@ def test_a_block_is_written_with_attributes_and_semantics(tmp_path):
     for name, expected in (("r000c000", 1), ("r000c001", 0)):
         out, attributes = tmp_path / f"{name}.city.jsonl", tmp_path / f"{name}.parquet"
         arguments = ["--scene", str(scene.folder / "scene.json"), "--buildings", str(tmp_path / "buildings.parquet")]
-        solids.main(
-            [*arguments, "--name", name, "--lod-label", "2.2", "--out", str(out), "--attributes", str(attributes)]
-        )
+        arguments += ["--name", name, "--lod-label", "2.2", "--meshes", str(tmp_path / f"{name}.meshes.parquet")]
+        solids.main([*arguments, "--out", str(out), "--attributes", str(attributes)])
         head, *lines = [json.loads(line) for line in out.read_text().splitlines()]
         rows = pq.read_table(attributes)
         assert rows.schema.equals(features.ATTRIBUTES)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-SLOW = {"scipy", "skimage", "pandas", "geopandas", "onnx", "jsonschema", "torch", "snakemake", "trimesh", "pyogrio"}
+SLOW = {"scipy", "skimage", "pandas", "geopandas", "onnx", "jsonschema", "torch", "snakemake", "pyogrio"}
 MAIN = "import sys, {name}; print(*{slow!r} & sys.modules.keys())"
 NO_PANDAS = """
 from kibs_steps import cli

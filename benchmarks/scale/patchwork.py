@@ -21,7 +21,7 @@ from rasterio.windows import Window
 GSD = 0.38
 PATCH = 1024  # px: no multiple of a block's side, so blocks differ
 SIDE = 1400  # px of a library scene
-STYLES = ("town", "suburb", "town", "centre", "mixed")
+STYLES = ("farm", "town", "farm", "farm", "village", "farm", "farm", "industry", "farm", "farm")  # as round Mourmelon
 VIEW = {"view_azimuth": 181.1, "view_elevation": 59.3, "sun_azimuth": 155.0, "sun_elevation": 45.0}
 DENSEST = 300  # buildings per km² that the library must reach
 ORIGIN = (500_000.0, 5_400_000.0)

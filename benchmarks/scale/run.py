@@ -40,7 +40,7 @@ SIZES = {
     "86": (8687, 9890),
     "804": (30564, 26320),
 }  # Mpx: px; the last two the paper's
-FLOOD_SIDES = [400, 800, 1600]
+FLOOD_SIDES = [2048, 3072, 5120]  # px: beyond what a processor keeps in its cache, as a city is
 UNEQUAL = ("run.json", ".fingerprints.json")  # what two runs may differ in
 
 

@@ -22,24 +22,23 @@ TICK = os.sysconf("SC_CLK_TCK")
 
 def processes(root: int) -> dict[int, tuple[str, float, float]]:
     """Step name, CPU seconds and peak MB of the process `root` and all below it."""
-    parent, facts = {}, {}
+    parent, cpu = {}, {}
     for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        with contextlib.suppress(OSError, IndexError, ValueError):
-            stat = (entry / "stat").read_text().rsplit(")", 1)[1].split()
-            peak = re.search(r"VmHWM:\s+(\d+)", (entry / "status").read_text())
-            words = (entry / "cmdline").read_bytes().decode(errors="replace").split("\0")
-            parent[int(entry.name)] = int(stat[1])
-            cpu = (int(stat[11]) + int(stat[12])) / TICK
-            facts[int(entry.name)] = step_of(words), cpu, int(peak.group(1)) / 1024 if peak else 0.0
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError, IndexError, ValueError):
+                stat = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+                parent[int(entry.name)] = int(stat[1])
+                cpu[int(entry.name)] = (int(stat[11]) + int(stat[12])) / TICK
     found = {}
-    for pid, fact in facts.items():
+    for pid in parent:
         above = pid
         while above not in (root, 0, 1) and above in parent:
             above = parent[above]
         if above == root:
-            found[pid] = fact
+            with contextlib.suppress(OSError):
+                peak = re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
+                words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+                found[pid] = step_of(words), cpu[pid], int(peak.group(1)) / 1024 if peak else 0.0
     return found
 
 

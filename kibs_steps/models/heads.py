@@ -89,14 +89,15 @@ def traits(labels: np.ndarray, roof: np.ndarray, edge: np.ndarray, distance: np.
     n = int(labels.max(initial=0))
     area = np.bincount(labels.ravel(), minlength=n + 1)[1:]
     length = np.bincount(labels[rim], minlength=n + 1)[1:]
-    summit = np.full(n + 1, -np.inf)
-    np.maximum.at(summit, labels.ravel(), (distance - edge).ravel())
+    level = distance - edge
+    summit = np.full(n + 1, -np.inf, level.dtype)  # numpy is quick where no value changes its type
+    np.maximum.at(summit, labels.ravel(), level.ravel())
     return {
         "log_area": np.log(np.maximum(area, 1)),
         "roof": mean_by_label(roof, labels),
         "rim": mean_by_label(edge, np.where(rim, labels, 0), n),
         "inside": mean_by_label(edge, np.where(rim, 0, labels), n),
-        "summit": summit[1:],
+        "summit": summit[1:].astype(np.float64),
         "rim_length": length**2 / (16.0 * np.maximum(area, 1)),
     }
 
@@ -116,7 +117,7 @@ def joined_basins(basins: np.ndarray, level: np.ndarray, prominence: float) -> n
     that leads to a higher summit.
     """
     n = int(basins.max(initial=0))
-    summit = np.full(n + 1, -np.inf)
+    summit = np.full(n + 1, -np.inf, level.dtype)
     np.maximum.at(summit, basins.ravel(), level.ravel())
     passes = []
     for a, b in (

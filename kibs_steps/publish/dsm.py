@@ -1,16 +1,14 @@
 """DSM: `dsm.tif`, terrain and buildings as one surface, in the map frame.
 
-In: the scene, its terrain, the blocks' solids. Out: absolute heights (m, float32), a Cloud Optimized GeoTIFF with the grid's
-pixels laid
-over where things *stand*: a pixel has the height of the highest roof over its centre, else of the terrain. What was moved
-beyond the
-raster's edge is cut off. Pixels are worked on in windows, so memory does not grow with the raster.
+In: the scene, its terrain, the blocks' meshes. Out: absolute heights (m, float32), a Cloud Optimized GeoTIFF with the grid's
+pixels laid over where things *stand*: a pixel has the height of the highest roof over its centre, else of the terrain. What was
+moved beyond the raster's edge is cut off. Pixels are worked on in windows, so memory does not grow with the raster.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,31 +19,41 @@ from numpy.typing import NDArray
 from kibs_steps import cli, view, zbuffer
 from kibs_steps import scene as scenes
 from kibs_steps.grid import Grid
+from kibs_steps.mesh import KINDS, Mesh, meshes
 from kibs_steps.publish import licences
-from kibs_steps.publish.mesh import KINDS, meshes
 from kibs_steps.publish.rasters import CACHE, SIDE, cloud_optimized
 
 
 class Roofs(NamedTuple):
-    """Roof faces of the whole city, and a tree of their boxes in plan."""
+    """Roof faces of the whole city as numbers: `points` (n, 3) map m of all rings, how many of them each ring has, how many
+    rings each face has, and a tree of the faces' boxes in plan."""
 
-    faces: list[zbuffer.Polygon]
+    points: NDArray[np.float64]
+    ends: NDArray[np.int64]  # of rings, in `points`
+    last: NDArray[np.int64]  # of faces, in `ends`
     tree: shapely.STRtree
 
     def over(self, frame: Grid) -> list[zbuffer.Polygon]:
         """The faces whose boxes meet a frame, in a fixed order."""
-        return [self.faces[k] for k in sorted(self.tree.query(shapely.box(*frame.bounds)))]
+        found = []
+        for face in sorted(self.tree.query(shapely.box(*frame.bounds))):
+            rings = range(self.last[face - 1] if face else 0, self.last[face])
+            ring, *holes = (self.points[self.ends[r - 1] if r else 0 : self.ends[r]] for r in rings)
+            found.append(zbuffer.Polygon(ring, tuple(holes)))
+        return found
 
 
-def roofs(paths: Sequence[str]) -> Roofs:
+def roofs(found: Iterable[Mesh]) -> Roofs:
     """The roof faces of the published solids."""
-    faces, boxes = [], []
-    for mesh in meshes(paths):
-        for k in np.flatnonzero(mesh.kind == KINDS.index("RoofSurface")):
-            ring, *holes = mesh.rings[k]
-            faces.append(zbuffer.Polygon(ring, tuple(holes)))
-            boxes.append(shapely.box(*ring[:, :2].min(axis=0), *ring[:, :2].max(axis=0)))
-    return Roofs(faces, shapely.STRtree(np.array(boxes, object)))
+    points, lengths, counts, boxes = [np.zeros((0, 3))], [], [], [np.zeros((0, 4))]
+    for mesh in found:
+        rings = [face for face, kind in zip(mesh.rings, mesh.kind, strict=True) if KINDS[kind] == "RoofSurface"]
+        counts += map(len, rings)
+        lengths += [len(ring) for face in rings for ring in face]
+        points += [ring for face in rings for ring in face]
+        boxes += [np.r_[face[0][:, :2].min(axis=0), face[0][:, :2].max(axis=0)][None] for face in rings]
+    tree = shapely.STRtree(shapely.box(*np.concatenate(boxes).T))
+    return Roofs(np.concatenate(points), np.cumsum(lengths, dtype=np.int64), np.cumsum(counts, dtype=np.int64), tree)
 
 
 def surface(found: Roofs, frame: Grid, terrain: view.Surface) -> NDArray[np.float32]:
@@ -63,14 +71,14 @@ def main(argv: list[str] | None = None) -> None:
     """Write terrain and buildings as one height raster."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.dsm", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
-    parser.add_argument("--solids", nargs="+", required=True, help="solids.city.jsonl of every block")
+    parser.add_argument("--meshes", nargs="+", required=True, help="meshes.parquet of every block")
     parser.add_argument(
         "--models", nargs="*", default=[], help="models/*.json: their licence goes into the file's tags"
     )
     parser.add_argument("--out", required=True, help="out: dsm.tif")
     args = parser.parse_args(argv)
     scene = scenes.read(args.scene)
-    found = roofs(args.solids)
+    found = roofs(meshes(args.meshes))
     tags = {"UNIT": "m", **({"LICENCE": line} if (line := licences.line(args.models)) else {})}
     with (
         rasterio.Env(GDAL_CACHEMAX=CACHE),
@@ -82,4 +90,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -1,18 +1,18 @@
 """KSR: `ksr/points.ply`, oriented points for Kinetic Shape Reconstruction and its kin.
 
 The paper meshes with KSR (CGAL), which needs points with normals; fed roofs alone it gives nothing closed. In: the blocks'
-solids, the
-terrain. Out: a binary PLY, map frame, absolute z, with `x y z nx ny nz label`: points of roofs (1) and walls (2) with their
-outward
-normals every `STEP` m, and of the terrain (0), facing up, every `APART` m within `AROUND` m of buildings but not under them.
-Points lie on fixed lattices of each face, so the same city gives the same points.
+meshes, the terrain. Out: a binary PLY, map frame, absolute z, with `x y z nx ny nz label`: points of roofs (1) and walls (2)
+with their outward normals every `STEP` m, and of the terrain (0), facing up, every `APART` m within `AROUND` m of buildings but
+not under them. Points lie on fixed lattices, of each face or of the map, so the same city gives the same points. They are
+written building by building and square by square, so memory does not grow with them.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import shapely
@@ -20,108 +20,125 @@ from numpy.typing import NDArray
 
 from kibs_steps import cli, store, view
 from kibs_steps import scene as scenes
-from kibs_steps.publish.mesh import Mesh, meshes
+from kibs_steps.mesh import KINDS, Mesh, area_vectors, meshes, polygons
 
-STEP = 0.5  # m
+STEP = 0.75  # m
 APART = 1.0  # m
 AROUND = 8.0  # m
+SIDE = 256  # m, of the squares that the terrain is worked on in
+HEAD = 512  # bytes
 ROW = np.dtype([(n, "<f8") for n in ("x", "y", "z")] + [(n, "<f4") for n in ("nx", "ny", "nz")] + [("label", "u1")])
 
-
-def of_face(rings: list[NDArray[np.float64]], step: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (n, 3) on a planar face, a square lattice of `step` m within its own plane, and its outward normal (3,)."""
-    ring = rings[0] - rings[0][0]
-    normal = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)
-    size = np.linalg.norm(normal)
-    if size < 1e-9:
-        return np.zeros((0, 3)), np.array([0.0, 0.0, 1.0])
-    normal = normal / size
-    level = np.cross([0.0, 0.0, 1.0], normal)
-    across = level / np.linalg.norm(level) if np.linalg.norm(level) > 1e-6 else np.array([1.0, 0.0, 0.0])
-    axes = np.stack([across, np.cross(normal, across)])
-    origin = rings[0][0]
-    flat = shapely.make_valid(shapely.Polygon((rings[0] - origin) @ axes.T, [(r - origin) @ axes.T for r in rings[1:]]))
-    x0, y0, x1, y1 = flat.bounds
-    u, v = np.meshgrid(np.arange(x0 + step / 2, x1, step), np.arange(y0 + step / 2, y1, step))
-    lattice = np.column_stack([u.ravel(), v.ravel()])
-    lattice = lattice[shapely.contains_xy(flat, *lattice.T)]
-    return origin + lattice @ axes, normal
+TerrainOf = Callable[[tuple[float, float, float, float]], view.Surface]  # bounds (map m) to the surface there
 
 
-def of_building(mesh: Mesh) -> NDArray[np.void]:
-    """The points of a building's roofs and walls."""
-    rows = []
-    for kind, rings in zip(mesh.kind, mesh.rings, strict=True):
-        if kind < 2:
-            points, normal = of_face(rings, STEP)
-            rows.append(_rows(points, normal, int(kind) + 1))
-    return np.concatenate(rows) if rows else np.zeros(0, ROW)
-
-
-def of_ground(bases: list[shapely.Geometry], terrain: view.Surface) -> NDArray[np.void]:
-    """The points of the terrain round buildings whose walls stand on `bases` (map m)."""
-    if not bases:
-        return np.zeros(0, ROW)
-    covered = shapely.union_all(bases)
-    around = shapely.buffer(covered, AROUND, quad_segs=2)
-    rows = []
-    for part in shapely.get_parts(around):
-        x0, y0, x1, y1 = np.floor(part.bounds)
-        x, y = np.meshgrid(np.arange(x0, x1 + 1, APART) + APART / 2, np.arange(y0, y1 + 1, APART) + APART / 2)
-        place = np.column_stack([x.ravel(), y.ravel()])
-        place = place[shapely.contains_xy(part, *place.T)]
-        place = place[~shapely.contains_xy(covered, *place.T)]
-        rows.append(_rows(np.column_stack([place, terrain(place)]), np.array([0.0, 0.0, 1.0]), 0))
-    return np.concatenate(rows)
-
-
-def _rows(points: NDArray[np.float64], normal: NDArray[np.float64], label: int) -> NDArray[np.void]:
-    found = np.zeros(len(points), ROW)
-    for k, name in enumerate("xyz"):
-        found[name] = points[:, k]
-        found[f"n{name}"] = normal[k]
-    found["label"] = label
-    return found
+def of_building(mesh: Mesh, step: float = STEP) -> NDArray[np.void]:
+    """The points of a building's roofs and walls: a square lattice of `step` m in the plane of each face, from its lower left."""
+    owner = np.repeat(np.repeat(np.arange(len(mesh.count)), mesh.count), mesh.lengths)
+    points = mesh.vertices[mesh.corners]
+    origin = points[np.searchsorted(owner, np.arange(len(mesh.count)))]
+    local = points - origin[owner]
+    normal = area_vectors(points, mesh.lengths, mesh.count)
+    size = np.linalg.norm(normal, axis=1)
+    wanted = np.flatnonzero((mesh.kind != KINDS.index("GroundSurface")) & (size > 1e-9))
+    normal = normal / np.maximum(size, 1e-9)[:, None]
+    level = np.column_stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))])
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    across = np.where(length > 1e-6, level / np.maximum(length, 1e-6), [1.0, 0.0, 0.0])
+    up = np.cross(normal, across)
+    flat = np.column_stack([(local * across[owner]).sum(axis=1), (local * up[owner]).sum(axis=1)])
+    shapes = shapely.make_valid(polygons(flat, mesh.lengths, mesh.count))
+    low, high = np.split(shapely.bounds(shapes[wanted]), 2, axis=1)
+    cols, lines = np.maximum(np.ceil((high - low) / step - 0.5), 0).astype(np.int64).T
+    of = np.repeat(np.arange(len(wanted)), cols * lines)
+    number = np.arange(len(of)) - np.repeat(np.cumsum(cols * lines) - cols * lines, cols * lines)
+    line, col = np.divmod(number, np.maximum(cols, 1)[of])
+    place = low[of] + (np.column_stack([col, line]) + 0.5) * step
+    inside = shapely.contains_xy(shapes[wanted[of]], *place.T)
+    f, (u, v) = wanted[of[inside]], place[inside].T
+    return _rows(origin[f] + u[:, None] * across[f] + v[:, None] * up[f], normal[f], mesh.kind[f] + 1)
 
 
 def base_of(mesh: Mesh) -> shapely.Geometry:
     """Where a building's walls stand (map m)."""
-    grounds = [rings for kind, rings in zip(mesh.kind, mesh.rings, strict=True) if kind == 2]
+    grounds = [rings for kind, rings in zip(mesh.kind, mesh.rings, strict=True) if KINDS[kind] == "GroundSurface"]
     return shapely.union_all(
         [shapely.make_valid(shapely.Polygon(r[0][:, :2], [h[:, :2] for h in r[1:]])) for r in grounds]
     )
 
 
-def write(path: Path, found: Iterable[Mesh], terrain: view.Surface, crs: str) -> int:
+def of_ground(bases: list[shapely.Geometry], terrain_of: TerrainOf) -> Iterator[NDArray[np.void]]:
+    """The points of the terrain round buildings whose walls stand on `bases` (map m), square by square."""
+    if not bases:
+        return
+    every, tree, box = np.array(bases), shapely.STRtree(bases), shapely.total_bounds(bases)
+    low, high = (np.floor(edge / SIDE).astype(int) for edge in (box[:2] - AROUND, box[2:] + AROUND))
+    steps = np.arange(0, SIDE, APART) + APART / 2
+    for row in range(low[1], high[1] + 1):
+        for col in range(low[0], high[0] + 1):
+            square = (col * SIDE, row * SIDE, (col + 1) * SIDE, (row + 1) * SIDE)
+            near = every[np.sort(tree.query(shapely.box(*square), "dwithin", AROUND))]
+            if not len(near):
+                continue
+            x, y = (v.ravel() for v in np.meshgrid(square[0] + steps, square[1] + steps))
+            covered = shapely.union_all(near)
+            around = shapely.union_all(shapely.buffer(near, AROUND, quad_segs=4))
+            wanted = shapely.contains_xy(around, x, y) & ~shapely.contains_xy(covered, x, y)
+            at = np.column_stack([x, y])[wanted]
+            yield _rows(np.column_stack([at, terrain_of(square)(at)]), np.array([[0.0, 0.0, 1.0]]), 0)
+
+
+def _rows(points: NDArray[np.float64], normal: NDArray[np.float64], label: NDArray[np.int8] | int) -> NDArray[np.void]:
+    """Points (n, 3) with normals (n, 3) or (1, 3)."""
+    found = np.zeros(len(points), ROW)
+    for k, name in enumerate("xyz"):
+        found[name] = points[:, k]
+        found[f"n{name}"] = normal[:, k]
+    found["label"] = label
+    return found
+
+
+def write(path: Path, found: Iterable[Mesh], terrain_of: TerrainOf, crs: str) -> int:
     """Write the points of all buildings and the ground round them; returns how many."""
-    parts, bases = [], []
-    for mesh in found:
-        parts.append(of_building(mesh))
-        bases.append(base_of(mesh))
-    points = np.concatenate([*parts, of_ground(bases, terrain)])
-    kinds = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
-    head = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment {crs.splitlines()[0]}, metres; label 0 ground, 1 roof, 2 wall",
-    ]
-    head += [f"element vertex {len(points)}"]
-    head += [f"property {kinds[ROW[name].str]} {name}" for name in ROW.names]
-    path.write_bytes(("\n".join([*head, "end_header"]) + "\n").encode() + points.tobytes())
+    count, bases = 0, []
+    with path.open("wb") as out:
+        out.write(b" " * HEAD)
+        for mesh in found:
+            bases.append(base_of(mesh))
+            count += _append(out, of_building(mesh))
+        for points in of_ground(bases, terrain_of):
+            count += _append(out, points)
+        out.seek(0)
+        out.write(head(count, crs))
+    return count
+
+
+def _append(out: BinaryIO, points: NDArray[np.void]) -> int:
+    out.write(points.tobytes())
     return len(points)
+
+
+def head(count: int, crs: str) -> bytes:
+    """The header of a PLY with so many points, `HEAD` bytes long."""
+    kinds = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kinds[ROW[name].str]} {name}" for name in ROW.names]
+    told = f"comment {crs.splitlines()[0][:120]}, metres; label 0 ground, 1 roof, 2 wall"
+    text = "\n".join([*lines, told]).encode()
+    return text.ljust(HEAD - len(b"\nend_header\n")) + b"\nend_header\n"
 
 
 def main(argv: list[str] | None = None) -> None:
     """Write oriented points of roofs, walls and ground."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.ksr", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
-    parser.add_argument("--solids", nargs="+", required=True, help="solids.city.jsonl of every block")
+    parser.add_argument("--meshes", nargs="+", required=True, help="meshes.parquet of every block")
     parser.add_argument("--out", required=True, help="out: ksr/points.ply")
     args = parser.parse_args(argv)
     scene = scenes.read(args.scene)
     with store.whole(args.out) as temporary:
-        write(temporary, meshes(args.solids), scene.terrain(scene.grid.bounds), scene.grid.crs)
+        write(temporary, meshes(args.meshes), scene.terrain, scene.grid.crs)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -1,8 +1,7 @@
 """OBJ: `city.obj`, the city as plain text: an object per building, a group per kind of surface.
 
-In: the blocks' solids. Out: Wavefront OBJ in metres, x east, y north, z up, from the origin named in its head, and `city.mtl`,
-the
-colours of its three materials.
+In: the blocks' meshes. Out: Wavefront OBJ in metres, x east, y north, z up, from the origin named in its head, and `city.mtl`,
+the colours of its three materials.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import numpy as np
 
 from kibs_steps import cli, store
 from kibs_steps import scene as scenes
+from kibs_steps.mesh import COLOURS, KINDS, Mesh, by_kind, meshes
 from kibs_steps.publish.glb import origin_of
-from kibs_steps.publish.mesh import COLOURS, KINDS, Mesh, indexed, meshes
 
 
 def write(out: TextIO, found: Iterable[Mesh], origin: np.ndarray, crs: str, materials: str) -> None:
@@ -26,15 +25,20 @@ def write(out: TextIO, found: Iterable[Mesh], origin: np.ndarray, crs: str, mate
     out.write(f"mtllib {materials}\n")
     used = 0
     for mesh in found:
-        points, faces, kind = indexed(mesh, origin)
+        points, faces, kind = by_kind(mesh)
         out.write(f"o building-{mesh.building}\n")
-        np.savetxt(out, points, fmt="v %.3f %.3f %.3f")
+        out.write(_lines("v %.3f %.3f %.3f\n", points - origin))
         for k, name in enumerate(KINDS):
             mine = faces[kind[faces[:, 0]] == k]
             if len(mine):
                 out.write(f"g {name}\nusemtl {name}\n")
-                np.savetxt(out, mine + used + 1, fmt="f %d %d %d")
+                out.write(_lines("f %d %d %d\n", mine + used + 1))
         used += len(points)
+
+
+def _lines(form: str, rows: np.ndarray) -> str:
+    """A line for each row of numbers."""
+    return form * len(rows) % tuple(rows.ravel().tolist())
 
 
 def materials() -> str:
@@ -50,7 +54,7 @@ def main(argv: list[str] | None = None) -> None:
     """Write the city as Wavefront OBJ."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.obj", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
-    parser.add_argument("--solids", nargs="+", required=True, help="solids.city.jsonl of every block")
+    parser.add_argument("--meshes", nargs="+", required=True, help="meshes.parquet of every block")
     parser.add_argument("--out", required=True, help="out: city.obj")
     parser.add_argument("--materials", required=True, help="out: city.mtl, beside it")
     args = parser.parse_args(argv)
@@ -58,8 +62,8 @@ def main(argv: list[str] | None = None) -> None:
     with store.whole(args.materials) as temporary:
         temporary.write_text(materials(), encoding="utf-8")
     with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
-        write(out, meshes(args.solids), origin_of(scene), scene.grid.crs, Path(args.materials).name)
+        write(out, meshes(args.meshes), origin_of(scene), scene.grid.crs, Path(args.materials).name)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

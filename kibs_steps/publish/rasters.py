@@ -31,7 +31,7 @@ from kibs_steps.publish import licences
 from kibs_steps.scene import Scene
 from kibs_steps.view import Plane
 
-SIDE = 2048  # px: side of the windows, a multiple of the files' own blocks
+SIDE = 1024  # px: side of the windows, a multiple of the files' own blocks
 CACHE = 64  # MB that GDAL may keep; its default grows with the machine
 PLANE = ("plane_a", "plane_b", "plane_c", "x0", "y0")
 

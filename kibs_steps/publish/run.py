@@ -41,7 +41,6 @@ LIBRARIES = (
     "opencv-python-headless",
     "scikit-image",
     "pillow",
-    "trimesh",
 )
 MOST = 20  # reasons listed
 SIMPLER = ("1.3", "1.2", "0")  # levels of detail below a full roof, whatever that is called

@@ -1,33 +1,34 @@
 """3D Tiles: `tiles3d/`, the city for web globes (3D Tiles 1.1): squares of the map as GLB, placed on the Earth.
 
-In: the blocks' solids. Out: `tileset.json` and one GLB per square of `SIDE` metres. Every vertex is brought to geocentric
-coordinates
-by PROJ and stored in the local east-north-up frame of the scene's centre, so that the grid's convergence and scale are right; the
-tileset's transform places that frame. Each vertex carries the number of its building (EXT_mesh_features), and a property
-table says which that is (EXT_structural_metadata: `building_id, height, ground_z, volume`). Without a vertical CRS heights
-count from the ellipsoid.
+In: the blocks' meshes. Out: `tileset.json` and one GLB per square of `SIDE` metres. Every vertex is brought to geocentric
+coordinates by PROJ and stored in the local east-north-up frame of the scene's centre, so that the grid's convergence and scale
+are right; the tileset's transform places that frame. Each vertex carries the number of its building (EXT_mesh_features), and a
+property table says which that is (EXT_structural_metadata: `building_id, height, ground_z, volume`). Without a vertical CRS
+heights count from the ellipsoid.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import shutil
-from collections import OrderedDict, defaultdict
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
-import trimesh
 
 from kibs_steps import cli, store
 from kibs_steps import scene as scenes
+from kibs_steps.mesh import COLOURS, Mesh, by_kind, read
 from kibs_steps.publish import licences
-from kibs_steps.publish.glb import matt, y_up
-from kibs_steps.publish.mesh import COLOURS, Mesh, indexed, meshes
+from kibs_steps.publish.glb import MATT
+from kibs_steps.publish.gltf import Glb, y_up
 
 SIDE = 256.0  # m
+KEPT = 16  # blocks in memory
 GEOCENTRIC = "EPSG:4978"
 NUMBERS = {"building_id": np.uint32, "height": np.float32, "ground_z": np.float32, "volume": np.float32}
 
@@ -63,62 +64,47 @@ class Earth:
         return matrix.T.ravel().tolist()
 
 
-def content(found: list[Mesh], earth: Earth) -> tuple[bytes, np.ndarray]:
-    """The GLB of some buildings and their bounds (2, 3) in the local frame."""
+def content(path: Path, found: list[Mesh], earth: Earth) -> np.ndarray:
+    """Write the GLB of some buildings; returns their bounds (2, 3) in the local frame."""
     every, faces, colours, number = [], [], [], []
     used = 0
     for k, mesh in enumerate(found):
-        base = np.floor(mesh.triangles.reshape(-1, 3).min(axis=0))
-        points, index, kind = indexed(mesh, base)
-        every.append(earth.local(points + base))
+        points, index, kind = by_kind(mesh)
+        every.append(points)
         faces.append(index + used)
         colours.append(COLOURS[kind])
         number.append(np.full(len(points), k, np.float32))
         used += len(points)
-    points, colour = np.concatenate(every), np.concatenate(colours)
+    points, colour = earth.local(np.concatenate(every)), np.concatenate(colours)
     centre = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
-    body = trimesh.Trimesh(
-        y_up(points - centre),
-        np.concatenate(faces),
-        vertex_colors=np.column_stack([colour, np.full(len(colour), 255, np.uint8)]),
-        vertex_attributes={"_FEATURE_ID_0": np.concatenate(number)},
-        process=False,
-    )
-    world = trimesh.Scene()
-    world.add_geometry(
-        body,
-        node_name="buildings",
-        geom_name="buildings",
-        transform=trimesh.transformations.translation_matrix(y_up(centre[None])[0]),
-    )
-
-    def tables(buffers: OrderedDict[Any, bytes], tree: dict[str, Any]) -> None:
-        columns = {}
-        for name, kind in NUMBERS.items():
-            values = [mesh.building if name == "building_id" else mesh.attributes.get(name) or 0.0 for mesh in found]
-            buffers[f"property {name}"] = _padded(np.array(values, kind).tobytes())
-            columns[name] = {"values": len(buffers) - 1}
-        table = {"name": "buildings", "class": "building", "count": len(found), "properties": columns}
-        types = {np.uint32: "UINT32", np.float32: "FLOAT32"}
-        properties = {name: {"type": "SCALAR", "componentType": types[kind]} for name, kind in NUMBERS.items()}
-        schema = {"id": "kibs", "classes": {"building": {"properties": properties}}}
-        tree["extensions"] = {"EXT_structural_metadata": {"schema": schema, "propertyTables": [table]}}
-
-    def finish(tree: dict[str, Any]) -> None:
-        matt(tree)
-        tree["extensionsUsed"] = ["EXT_mesh_features", "EXT_structural_metadata"]
+    with Glb(path.parent) as glb:
+        opaque = np.column_stack([colour, np.full(len(colour), 255, np.uint8)])
+        attributes = {
+            "COLOR_0": glb.accessor("colours", opaque, normalized=True),
+            "_FEATURE_ID_0": glb.accessor("features", np.concatenate(number)),
+        }
+        body = {**glb.primitive(y_up(points - centre), np.concatenate(faces), **attributes), "material": 0}
         ids = {"featureCount": len(found), "attribute": 0, "propertyTable": 0}
-        tree["meshes"][0]["primitives"][0]["extensions"] = {"EXT_mesh_features": {"featureIds": [ids]}}
+        body["extensions"] = {"EXT_mesh_features": {"featureIds": [ids]}}
+        mesh = glb.add("meshes", {"name": "buildings", "primitives": [body]})
+        node = {"name": "buildings", "mesh": mesh, "translation": y_up(centre[None])[0].tolist()}
+        more = {"materials": [MATT], "extensionsUsed": ["EXT_mesh_features", "EXT_structural_metadata"]}
+        more["extensions"] = {"EXT_structural_metadata": _properties(glb, found)}
+        glb.save(path, {"nodes": [glb.add("nodes", node)]}, **more)
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
-    glb = trimesh.exchange.gltf.export_glb(
-        world, include_normals=False, tree_postprocessor=finish, buffer_postprocessor=tables
-    )
-    return glb, np.stack([points.min(axis=0), points.max(axis=0)])
 
-
-def _padded(values: bytes) -> bytes:
-    """Bytes up to a multiple of 8, as property tables must start."""
-    return values + b"\0" * (-len(values) % 8)
+def _properties(glb: Glb, found: list[Mesh]) -> dict[str, Any]:
+    """The property table of buildings and its schema."""
+    columns = {}
+    for name, kind in NUMBERS.items():
+        values = [mesh.building if name == "building_id" else mesh.attributes.get(name) or 0.0 for mesh in found]
+        columns[name] = {"values": glb.view(f"property {name}", np.array(values, kind).tobytes())[0]}
+    table = {"name": "buildings", "class": "building", "count": len(found), "properties": columns}
+    types = {np.uint32: "UINT32", np.float32: "FLOAT32"}
+    properties = {name: {"type": "SCALAR", "componentType": types[kind]} for name, kind in NUMBERS.items()}
+    schema = {"id": "kibs", "classes": {"building": {"properties": properties}}}
+    return {"schema": schema, "propertyTables": [table]}
 
 
 def box(bounds: np.ndarray) -> dict[str, list[float]]:
@@ -127,18 +113,31 @@ def box(bounds: np.ndarray) -> dict[str, list[float]]:
     return {"box": [round(float(v), 3) for v in (*bounds.mean(axis=0), half[0], 0, 0, 0, half[1], 0, 0, 0, half[2])]}
 
 
-def write(folder: Path, found: Iterable[Mesh], earth: Earth, asset: dict[str, Any]) -> None:
-    """Write the tileset into a new folder; one square of the map is held in memory at a time but for its place."""
-    squares: dict[tuple[int, int], list[Mesh]] = defaultdict(list)
-    for mesh in found:
-        middle = mesh.triangles.reshape(-1, 3)[:, :2].mean(axis=0)
-        squares[tuple(int(v) for v in middle // SIDE)].append(mesh)
+def squares(paths: Sequence[str]) -> Iterator[tuple[tuple[int, int], list[Mesh]]]:
+    """Squares of the map (column, row of `SIDE` m) with the buildings whose middle they hold, in order.
+
+    What is in memory is a number for each building, and the blocks that the square's buildings come from.
+    """
+    of: dict[tuple[int, int], list[tuple[str, int]]] = defaultdict(list)
+    for path in paths:
+        for k, mesh in enumerate(read(store.read_table(path))):
+            middle = (mesh.vertices[:, :2].min(axis=0) + mesh.vertices[:, :2].max(axis=0)) / 2
+            of[tuple(int(v) for v in middle // SIDE)].append((path, k))
+    table = functools.lru_cache(maxsize=KEPT)(store.read_table)
+    for place in sorted(of):
+        found = [next(read(table(path).slice(k, 1))) for path, k in of[place]]
+        yield place, sorted(found, key=lambda mesh: mesh.building)
+
+
+def write(
+    folder: Path, found: Iterable[tuple[tuple[int, int], list[Mesh]]], earth: Earth, asset: dict[str, Any]
+) -> None:
+    """Write the tileset into a new folder, square by square."""
     children, bounds = [], []
-    for place in sorted(squares):
-        glb, extent = content(squares[place], earth)
+    for place, buildings in found:
         name = f"{place[0]}_{place[1]}.glb"
         with store.whole(folder / name) as temporary:
-            temporary.write_bytes(glb)
+            extent = content(temporary, buildings, earth)
         children.append({"boundingVolume": box(extent), "geometricError": 0.0, "content": {"uri": name}})
         bounds.append(extent)
     whole = np.stack([np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]]) if bounds else np.zeros((2, 3))
@@ -154,7 +153,7 @@ def main(argv: list[str] | None = None) -> None:
     """Write the city as 3D Tiles."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.tiles3d", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
-    parser.add_argument("--solids", nargs="+", required=True, help="solids.city.jsonl of every block")
+    parser.add_argument("--meshes", nargs="+", required=True, help="meshes.parquet of every block")
     parser.add_argument("--models", nargs="*", default=[], help="models/*.json: their licences go into the asset")
     parser.add_argument("--out", required=True, help="out: tileset.json in a folder of its own")
     args = parser.parse_args(argv)
@@ -167,10 +166,10 @@ def main(argv: list[str] | None = None) -> None:
     making = folder.with_name(f".tmp-{folder.name}")
     shutil.rmtree(making, ignore_errors=True)
     making.mkdir(parents=True)
-    write(making, meshes(args.solids), earth, {"extras": {k: v for k, v in told.items() if v}})
+    write(making, squares(args.meshes), earth, {"extras": {k: v for k, v in told.items() if v}})
     shutil.rmtree(folder, ignore_errors=True)
     making.rename(folder)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, pandas=False)

@@ -85,9 +85,9 @@ def build(
     every = [f for name in order(blocks) for f in of(name, "ground.parquet")]
     buildings.main([*scene, *cut, "--ground", *every, "--out", str(folder / "buildings.parquet")])
     for name in blocks:
-        seq, table = of(name, "solids.city.jsonl", "solids.parquet")
+        seq, table, meshes = of(name, "solids.city.jsonl", "solids.parquet", "meshes.parquet")
         given = ["--buildings", str(folder / "buildings.parquet"), "--name", name]
-        solids.main([*scene, *given, "--out", seq, "--attributes", table])
+        solids.main([*scene, *given, "--out", seq, "--attributes", table, "--meshes", meshes])
     return folder
 
 

@@ -37,6 +37,7 @@ def built(folder: Path) -> list[str]:
     arguments = ["--scene", str(scene.folder / "scene.json")]
     solids.main(
         [*arguments, "--buildings", str(folder / "buildings.parquet"), "--name", "r000c000",
-         "--out", str(folder / "solids.city.jsonl"), "--attributes", str(folder / "solids.parquet")]
+         "--out", str(folder / "solids.city.jsonl"), "--attributes", str(folder / "solids.parquet"),
+         "--meshes", str(folder / "meshes.parquet")]
     )  # fmt: skip
-    return [*arguments, "--solids", str(folder / "solids.city.jsonl")]
+    return [*arguments, "--meshes", str(folder / "meshes.parquet")]

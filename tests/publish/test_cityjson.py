@@ -35,6 +35,7 @@ def city(tmp_path, cut=("r000c000", "r000c001"), extra=()):
         sequences.append(str(tmp_path / f"{name}.city.jsonl"))
         arguments = ["--scene", str(scene.folder / "scene.json"), "--buildings", str(tmp_path / "buildings.parquet")]
         arguments += ["--name", name, "--out", sequences[-1], "--attributes", str(tmp_path / f"{name}.parquet")]
+        arguments += ["--meshes", str(tmp_path / f"{name}.meshes.parquet")]
         solids.main(arguments)
     out, lines = tmp_path / "city.city.json", tmp_path / "city.city.jsonl"
     arguments = [

@@ -15,8 +15,9 @@ import rasterio
 import toy_city
 import trimesh
 
+from kibs_steps import mesh
 from kibs_steps import scene as scenes
-from kibs_steps.publish import dsm, glb, ksr, mesh, obj, tiles3d, viewer
+from kibs_steps.publish import dsm, glb, ksr, obj, tiles3d, viewer
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def town(tmp_path_factory):
 
 def test_triangles_are_watertight_and_keep_the_volume(town):
     folder, _ = town
-    found = {m.building: m for m in mesh.meshes([folder / "solids.city.jsonl"])}
+    found = {m.building: m for m in mesh.meshes([folder / "meshes.parquet"])}
     assert sorted(found) == sorted(city.VOLUMES)
     for building, volume in city.VOLUMES.items():
         body = trimesh.Trimesh(
@@ -46,7 +47,9 @@ def test_triangles_are_watertight_and_keep_the_volume(town):
 def test_a_face_with_a_hole_is_triangulated_with_its_vertices_only():
     outer = np.array([[0, 0, 5], [9000, 0, 5], [9000, 9000, 5], [0, 9000, 5]])
     hole = np.array([[3000, 3000, 5], [3000, 6000, 5], [6000, 6000, 5], [6000, 3000, 5]])
-    triangles, face = mesh.triangulated([[outer, hole], [outer[::-1]]])
+    vertices = np.concatenate([outer, hole])
+    index, face = mesh.triangulated([[[0, 1, 2, 3], [4, 5, 6, 7]], [[3, 2, 1, 0]]], vertices)
+    triangles = vertices[index]
     area = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] / 2e6
     assert area[face == 0].sum() == 72.0
     assert (area[face == 0] > 0).all()
@@ -72,7 +75,7 @@ def test_glb_has_a_node_per_building_with_its_attributes(town, tmp_path):
         assert body.metadata["building_id"] == building
         points = trimesh.transform_points(body.vertices, transform)
         placed = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]]) + glb.origin_of(scene)
-        (expected,) = [m for m in mesh.meshes([folder / "solids.city.jsonl"]) if m.building == building]
+        (expected,) = [m for m in mesh.meshes([folder / "meshes.parquet"]) if m.building == building]
         low, high = expected.triangles.reshape(-1, 3).min(axis=0), expected.triangles.reshape(-1, 3).max(axis=0)
         np.testing.assert_allclose([placed.min(axis=0), placed.max(axis=0)], [low, high], atol=2e-3)
 
@@ -84,8 +87,8 @@ def test_roofs_wear_the_image_where_they_are_seen(town, tmp_path):
     world = trimesh.load(out)
     roof = world.geometry["building-201-roof"]
     scene = scenes.read(folder / "scene.json")
-    (expected,) = [m for m in mesh.meshes([folder / "solids.city.jsonl"]) if m.building == 201]
-    corners = expected.triangles[expected.kind[expected.surface] == 0].reshape(-1, 3)
+    (expected,) = [m for m in mesh.meshes([folder / "meshes.parquet"]) if m.building == 201]
+    corners = expected.triangles[expected.kind[expected.face] == 0].reshape(-1, 3)
     seen = corners[:, :2].copy()
     for _ in range(40):
         seen = corners[:, :2] - (corners[:, 2] - toy_city.GROUND.at(seen))[:, None] * scene.lean
@@ -95,8 +98,9 @@ def test_roofs_wear_the_image_where_they_are_seen(town, tmp_path):
     assert roof.visual.material.baseColorTexture.size == (scene.grid.width, scene.grid.height)
 
 
-def test_an_empty_city_is_a_valid_glb():
-    assert trimesh.load(trimesh.util.wrap_as_stream(glb.empty({})), file_type="glb").is_empty
+def test_an_empty_city_is_a_valid_glb(tmp_path):
+    glb.write(tmp_path / "empty.glb", [], np.zeros(3), {})
+    assert trimesh.load(tmp_path / "empty.glb").is_empty
 
 
 def test_obj_is_read_back_with_the_volume(town, tmp_path):
@@ -108,7 +112,7 @@ def test_obj_is_read_back_with_the_volume(town, tmp_path):
     vertices = np.array([line.split()[1:] for line in text.splitlines() if line.startswith("v ")], float)
     faces = np.array([line.split()[1:] for line in text.splitlines() if line.startswith("f ")], int) - 1
     body = trimesh.Trimesh(vertices, faces)
-    total = sum(m.attributes["volume"] for m in mesh.meshes([folder / "solids.city.jsonl"]))
+    total = sum(m.attributes["volume"] for m in mesh.meshes([folder / "meshes.parquet"]))
     assert body.volume == pytest.approx(total, rel=1e-3)
 
 
@@ -137,7 +141,7 @@ def test_tiles_stand_at_their_place_on_the_earth(town, tmp_path):
         centre, half = np.array(child["boundingVolume"]["box"][:3]), np.array(child["boundingVolume"]["box"][3::4])
         assert (np.abs(z_up - centre) <= half + 0.01).all()
     assert sorted(ids) == sorted(city.VOLUMES)
-    corners = np.concatenate([m.triangles.reshape(-1, 3) for m in mesh.meshes([folder / "solids.city.jsonl"])])
+    corners = np.concatenate([m.triangles.reshape(-1, 3) for m in mesh.meshes([folder / "meshes.parquet"])])
     expected = np.column_stack(to_earth.transform(*corners.T))
     points = np.concatenate(points)
     for axis in range(3):
@@ -158,7 +162,7 @@ def test_points_lie_on_faces_and_look_outward(town, tmp_path):
     xyz = np.column_stack([points["x"], points["y"], points["z"]])
     normal = np.column_stack([points["nx"], points["ny"], points["nz"]])
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-5)
-    for m in mesh.meshes([folder / "solids.city.jsonl"]):
+    for m in mesh.meshes([folder / "meshes.parquet"]):
         origin = m.triangles[0, 0]
         body = trimesh.Trimesh(**trimesh.triangles.to_kwargs(m.triangles - origin))
         low, high = m.triangles.reshape(-1, 3).min(axis=0) - 0.1, m.triangles.reshape(-1, 3).max(axis=0) + 0.1
@@ -186,7 +190,7 @@ def test_dsm_is_terrain_with_roofs(town, tmp_path):
     rows, cols = np.mgrid[: scene.grid.height, : scene.grid.width]
     ground = toy_city.GROUND.at(scene.grid.to_map(np.stack([cols, rows], axis=-1) + 0.5))
     raised = heights - ground > 0.05
-    area = sum(m.attributes["footprint_area"] for m in mesh.meshes([folder / "solids.city.jsonl"]))
+    area = sum(m.attributes["footprint_area"] for m in mesh.meshes([folder / "meshes.parquet"]))
     assert raised.sum() * scene.grid.gsd**2 == pytest.approx(area, rel=0.03)
     np.testing.assert_allclose(heights[~raised], ground[~raised], atol=0.05)
     place = np.array([[toy_city.X0 + 10 + 7.0, toy_city.Y0 - 50 + 4.5]])  # on the hip's ridge
@@ -239,7 +243,7 @@ def test_gltf_validator_finds_no_error(town, tmp_path):
     glb.main([*arguments, "--out", str(tmp_path / "city.glb")])
     glb.main([*arguments, "--drape", "--out", str(tmp_path / "draped.glb")])
     tiles3d.main([*arguments, "--out", str(tmp_path / "tiles3d/tileset.json")])
-    (tmp_path / "empty.glb").write_bytes(glb.empty({"title": "none"}))
+    glb.write(tmp_path / "empty.glb", [], np.zeros(3), {"title": "none"})
     files = [str(f) for f in tmp_path.rglob("*.glb") if f.parent.name != ".sums"]
     script = """const v = require(process.argv[1]), fs = require("fs");
     (async () => { for (const f of process.argv.slice(2)) {

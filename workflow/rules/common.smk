@@ -114,7 +114,7 @@ def inputs(step, *outputs):
 
 
 LAST_STEP = {"detected": "feed", "fed": "feed", "solids.parquet": "solids"}
-LAST_STEP |= {"solids.city.jsonl": "solids"}
+LAST_STEP |= {"solids.city.jsonl": "solids", "meshes.parquet": "solids"}
 
 
 def blocks(path):
@@ -217,6 +217,7 @@ def kept(p):
         "ground.parquet",
         "solids.parquet",
         "solids.city.jsonl",
+        "meshes.parquet",
     ]
     return [
         f"results/{p.name}/blocks/{b.name}/{f}"

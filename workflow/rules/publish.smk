@@ -138,7 +138,7 @@ rule glb:
         scene=given("results/{scene}/scene.json"),
         raster=given(lambda w: sources.files(plan(w).raster)),
         dtm=given("results/{scene}/dtm.tif"),
-        solids=given(blocks("solids.city.jsonl")),
+        meshes=given(blocks("meshes.parquet")),
         models=given(licensed),
     output:
         "results/{scene}/city.glb",
@@ -152,7 +152,7 @@ rule glb:
         signature=signature("glb"),
         drape=lambda w: ["--drape"] if plan(w).settings["drape"] else [],
     shell:
-        "python -m kibs_steps.publish.glb --scene {input.scene:q} --solids {input.solids:q}"
+        "python -m kibs_steps.publish.glb --scene {input.scene:q} --meshes {input.meshes:q}"
         " --models {input.models:q} {params.drape} --out {output:q} > {log:q} 2>&1"
 
 
@@ -163,7 +163,7 @@ rule obj:
     """city.obj and its colours, city.mtl."""
     input:
         scene=given("results/{scene}/scene.json"),
-        solids=given(blocks("solids.city.jsonl")),
+        meshes=given(blocks("meshes.parquet")),
     output:
         city="results/{scene}/city.obj",
         materials="results/{scene}/city.mtl",
@@ -176,7 +176,7 @@ rule obj:
     params:
         signature=signature("solids"),
     shell:
-        "python -m kibs_steps.publish.obj --scene {input.scene:q} --solids {input.solids:q}"
+        "python -m kibs_steps.publish.obj --scene {input.scene:q} --meshes {input.meshes:q}"
         " --out {output.city:q} --materials {output.materials:q} > {log:q} 2>&1"
 
 
@@ -187,7 +187,7 @@ rule tiles3d:
     """tiles3d/: the city on the globe."""
     input:
         scene=given("results/{scene}/scene.json"),
-        solids=given(blocks("solids.city.jsonl")),
+        meshes=given(blocks("meshes.parquet")),
         models=given(licensed),
     output:
         "results/{scene}/tiles3d/tileset.json",
@@ -200,7 +200,7 @@ rule tiles3d:
     params:
         signature=signature("solids"),
     shell:
-        "python -m kibs_steps.publish.tiles3d --scene {input.scene:q} --solids {input.solids:q}"
+        "python -m kibs_steps.publish.tiles3d --scene {input.scene:q} --meshes {input.meshes:q}"
         " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
 
 
@@ -212,7 +212,7 @@ rule dsm:
     input:
         scene=given("results/{scene}/scene.json"),
         dtm=given("results/{scene}/dtm.tif"),
-        solids=given(blocks("solids.city.jsonl")),
+        meshes=given(blocks("meshes.parquet")),
         models=given(licensed),
     output:
         "results/{scene}/dsm.tif",
@@ -225,7 +225,7 @@ rule dsm:
     params:
         signature=signature("solids"),
     shell:
-        "python -m kibs_steps.publish.dsm --scene {input.scene:q} --solids {input.solids:q}"
+        "python -m kibs_steps.publish.dsm --scene {input.scene:q} --meshes {input.meshes:q}"
         " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
 
 
@@ -237,7 +237,7 @@ rule ksr:
     input:
         scene=given("results/{scene}/scene.json"),
         dtm=given("results/{scene}/dtm.tif"),
-        solids=given(blocks("solids.city.jsonl")),
+        meshes=given(blocks("meshes.parquet")),
     output:
         "results/{scene}/ksr/points.ply",
     log:
@@ -249,7 +249,7 @@ rule ksr:
     params:
         signature=signature("solids"),
     shell:
-        "python -m kibs_steps.publish.ksr --scene {input.scene:q} --solids {input.solids:q}"
+        "python -m kibs_steps.publish.ksr --scene {input.scene:q} --meshes {input.meshes:q}"
         " --out {output:q} > {log:q} 2>&1"
 
 
@@ -262,7 +262,7 @@ rule viewer:
         scene=given("results/{scene}/scene.json"),
         raster=given(lambda w: sources.files(plan(w).raster)),
         dtm=given("results/{scene}/dtm.tif"),
-        solids=given(blocks("solids.city.jsonl")),
+        meshes=given(blocks("meshes.parquet")),
         models=given(licensed),
     output:
         "results/{scene}/viewer.html",
@@ -275,7 +275,7 @@ rule viewer:
     params:
         signature=signature("solids"),
     shell:
-        "python -m kibs_steps.publish.viewer --scene {input.scene:q} --solids {input.solids:q}"
+        "python -m kibs_steps.publish.viewer --scene {input.scene:q} --meshes {input.meshes:q}"
         " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
 
 

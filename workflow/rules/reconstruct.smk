@@ -159,6 +159,7 @@ given = inputs(
     "solids_of_block",
     "results/{scene}/blocks/{block}/solids.city.jsonl",
     "results/{scene}/blocks/{block}/solids.parquet",
+    "results/{scene}/blocks/{block}/meshes.parquet",
 )
 
 
@@ -171,6 +172,7 @@ rule solids:
     output:
         solids="results/{scene}/blocks/{block}/solids.city.jsonl",
         attributes="results/{scene}/blocks/{block}/solids.parquet",
+        meshes="results/{scene}/blocks/{block}/meshes.parquet",
     log:
         "results/{scene}/logs/solids/{block}.log",
     benchmark:
@@ -182,4 +184,5 @@ rule solids:
         options=options("lod_label"),
     shell:
         "python -m kibs_steps.solids --scene {input.scene:q} --buildings {input.buildings:q} --name {wildcards.block}"
-        " {params.options:q} --out {output.solids:q} --attributes {output.attributes:q} > {log:q} 2>&1"
+        " {params.options:q} --out {output.solids:q} --attributes {output.attributes:q}"
+        " --meshes {output.meshes:q} > {log:q} 2>&1"

@@ -1,10 +1,8 @@
 """Viewer: `viewer.html`, the city in one file that any browser opens from disk, without a network.
 
-In: the scene with its image and terrain, the blocks' solids. Out: HTML with everything inside: three.js (`three.min.js.gz`:
-the names that
-`three.entry.js` lists, bundled and minified by esbuild from three 0.187, its licence header kept), the viewer's own script,
-and the
-city as gzipped arrays in base64. Solids come triangulated (`publish.mesh`), so the browser needs no triangulation of its own.
+In: the scene with its image and terrain, the blocks' meshes. Out: HTML with everything inside: three.js (`three.min.js.gz`:
+the names that `three.entry.js` lists, bundled and minified by esbuild from three 0.187, its licence header kept), the viewer's
+own script, and the city as gzipped arrays in base64.
 """
 
 from __future__ import annotations
@@ -15,64 +13,79 @@ import gzip
 import html
 import io
 import json
+import re
 from collections.abc import Iterable
 from importlib import resources
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from PIL import Image
 
 from kibs_steps import picture, store
 from kibs_steps import scene as scenes
+from kibs_steps.mesh import Mesh, meshes
 from kibs_steps.publish import licences
 from kibs_steps.publish.glb import origin_of
-from kibs_steps.publish.mesh import Mesh, meshes
 from kibs_steps.scene import Scene
 
 LONGEST = 1400  # px: longer side of the image on the ground
 TERRAIN = 160  # points of terrain along the longer side
 NO_AZIMUTH = 65535
+LEVEL = 6  # of compression
 SHOWN = ("building_id", "lod", "lod_reason", "roof_type", "height", "ground_z", "eave_z", "ridge_z", "volume", "footprint_area",
          "n_sections", "height_sigma", "position_sigma", "position_corrected")  # fmt: skip
 
 
-def packed(values: np.ndarray) -> dict[str, str]:
-    """An array as gzipped little-endian bytes in base64."""
-    kind = values.dtype.newbyteorder("<")
-    content = gzip.compress(values.astype(kind).tobytes(), 9, mtime=0)
-    return {"type": kind.str[1:], "gzip": base64.b64encode(content).decode()}
+class Packed:
+    """An array that grows, as gzipped little-endian bytes: memory holds it compressed."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind, self.content = kind, io.BytesIO()
+        self.file = gzip.GzipFile(fileobj=self.content, mode="wb", compresslevel=LEVEL, mtime=0)
+
+    def add(self, values: np.ndarray) -> None:
+        """Appends values."""
+        self.file.write(np.asarray(values).astype(f"<{self.kind}").tobytes())
+
+    def text(self) -> dict[str, str]:
+        """The array as JSON has it, in base64."""
+        self.file.close()
+        return {"type": self.kind, "gzip": base64.b64encode(self.content.getvalue()).decode()}
+
+
+KINDS_OF = {"positions": "i4", "surface": "u4", "building": "u4", "kind": "u1", "slope": "f4", "azimuth": "u2", "status": "u1",
+            "section": "u4"}  # fmt: skip
 
 
 def arrays(found: Iterable[Mesh], origin: np.ndarray) -> tuple[dict[str, Any], dict[str, list[Any]], list[str]]:
     """The city's arrays, attributes of buildings by column, and the names of statuses.
 
     `positions` cm from `origin` (3 corners × 3 coordinates per triangle), `surface` of each triangle; of each surface
-    `building` (row),
-    `kind`, `slope` (deg), `azimuth` (deg, `NO_AZIMUTH` none), `status` (place in the names), `section` (id, 0 none).
+    `building` (row), `kind`, `slope` (deg), `azimuth` (deg, `NO_AZIMUTH` none), `status` (place in the names), `section` (id, 0
+    none).
     """
     rows: dict[str, list[Any]] = {name: [] for name in SHOWN}
-    positions, surface, kind, owner, meaning = [], [], [], [], []
+    packs = {name: Packed(kind) for name, kind in KINDS_OF.items()}
+    names = ["ok"]
+    surfaces = 0
     for number, mesh in enumerate(found):
         for name in SHOWN:
             rows[name].append(mesh.building if name == "building_id" else mesh.attributes.get(name))
-        positions.append(np.rint((mesh.triangles - origin) * 100).astype(np.int32).reshape(-1, 9))
-        surface.append(mesh.surface + len(meaning))
-        kind.append(mesh.kind)
-        owner.append(np.full(len(mesh.kind), number))
-        meaning += mesh.surfaces
-    names = sorted({m["status"] for m in meaning if "status" in m}, key=lambda name: (name != "ok", name)) or ["ok"]
-    azimuth = [round(m["azimuth"]) % 360 if "azimuth" in m else NO_AZIMUTH for m in meaning]
-    columns = {
-        "positions": np.concatenate([np.zeros((0, 9), np.int32), *positions]),
-        "surface": np.concatenate([np.zeros(0, int), *surface]).astype(np.uint32),
-        "building": np.concatenate([np.zeros(0, int), *owner]).astype(np.uint32),
-        "kind": np.concatenate([np.zeros(0, np.int8), *kind]).astype(np.uint8),
-        "slope": np.array([m.get("slope", 0.0) for m in meaning], np.float32),
-        "azimuth": np.array(azimuth, np.uint16),
-        "status": np.array([names.index(m.get("status", names[0])) for m in meaning], np.uint8),
-        "section": np.array([m.get("section_id", 0) for m in meaning], np.uint32),
-    }
-    return {name: packed(values) for name, values in columns.items()}, rows, names
+        names += sorted({m["status"] for m in mesh.surfaces if "status" in m} - set(names))
+        of_building = {
+            "positions": np.rint((mesh.triangles - origin) * 100),
+            "surface": mesh.face + surfaces,
+            "building": np.full(len(mesh.kind), number),
+            "kind": mesh.kind,
+            "slope": np.array([m.get("slope", 0.0) for m in mesh.surfaces]),
+            "azimuth": np.array([round(m["azimuth"]) % 360 if "azimuth" in m else NO_AZIMUTH for m in mesh.surfaces]),
+            "status": np.array([names.index(m.get("status", "ok")) for m in mesh.surfaces]),
+            "section": np.array([m.get("section_id", 0) for m in mesh.surfaces]),
+        }
+        for name, values in of_building.items():
+            packs[name].add(values)
+        surfaces += len(mesh.kind)
+    return {name: pack.text() for name, pack in packs.items()}, rows, names
 
 
 def terrain_of(scene: Scene, origin: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
@@ -86,12 +99,14 @@ def terrain_of(scene: Scene, origin: np.ndarray) -> tuple[dict[str, Any], np.nda
     return {"cols": cols, "rows": rows, **{k: round(v, 3) for k, v in extent.items()}}, heights.astype(np.float32)
 
 
-def page(scene: Scene, found: Iterable[Mesh], licence: str) -> str:
-    """The whole HTML file."""
+def write(out: TextIO, scene: Scene, found: Iterable[Mesh], licence: str) -> None:
+    """Write the whole HTML file."""
     origin = origin_of(scene)
     columns, buildings, statuses = arrays(found, origin)
     terrain, heights = terrain_of(scene, origin)
-    columns["terrain"] = packed(heights)
+    pack = Packed("f4")
+    pack.add(heights)
+    columns["terrain"] = pack.text()
     rgb, _ = picture.overview(scene, LONGEST)
     jpeg = io.BytesIO()
     Image.fromarray(rgb).save(jpeg, "JPEG", quality=80)
@@ -118,19 +133,18 @@ def page(scene: Scene, found: Iterable[Mesh], licence: str) -> str:
         "DATA": content,
         "VIEWER": (here / "viewer.js").read_text(encoding="utf-8"),
     }
-    for name, part in parts.items():
-        text = text.replace(f"@{name}@", part, 1)
-    return text
+    for piece in re.split(f"@({'|'.join(parts)})@", text):
+        out.write(parts.get(piece, piece))
 
 
 def main(argv: list[str] | None = None) -> None:
     """Write the city as one HTML file."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.viewer", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
-    parser.add_argument("--solids", nargs="+", required=True, help="solids.city.jsonl of every block")
+    parser.add_argument("--meshes", nargs="+", required=True, help="meshes.parquet of every block")
     parser.add_argument("--models", nargs="*", default=[], help="models/*.json: their licences are shown")
     parser.add_argument("--out", required=True, help="out: viewer.html")
     args = parser.parse_args(argv)
     scene = scenes.read(args.scene)
-    with store.whole(args.out) as temporary:
-        temporary.write_text(page(scene, meshes(args.solids), licences.line(args.models)), encoding="utf-8")
+    with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
+        write(out, scene, meshes(args.meshes), licences.line(args.models))

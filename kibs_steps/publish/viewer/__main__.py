@@ -3,4 +3,4 @@
 from kibs_steps import cli
 from kibs_steps.publish.viewer import main
 
-cli.run(main)
+cli.run(main, pandas=False)
