@@ -9,13 +9,17 @@ Buildings that share edges all the same (across a high step, or a footprint's li
 
 In: all blocks' `ground.parquet`. Out: `buildings.parquet`, the same rows with `building_id` and `cluster_id`, the smallest
 `section_id` of each, and `block`: the block whose core holds the cluster's id pixel, so neither is ever cut. Blocks and
-the order of sections do not matter.
+the order of sections do not matter. Of the whole scene only numbers are in memory; outlines are read block by block, with those
+near.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -35,6 +39,8 @@ STEP = 3.0  # m, higher steps divide buildings
 FACING = -0.7  # cosine between the directions of two outlines that face each other
 OVERLAP = 0.25  # m², sections over each other by as much are together
 AT_ONCE = 250_000  # edge pairs held in memory
+KEPT = 48  # blocks held in memory: some rows of them
+PLANE = ("plane_a", "plane_b", "plane_c", "x0", "y0")
 
 
 def buildings(
@@ -50,33 +56,63 @@ def buildings(
     z = a(x−x0) + b(y−y0) + c; `lean` of the view, one or (n, 2); `footprint` (n,) number of the
     footprint each section stands in, −1 none.
     """
-    order = np.argsort(ids, kind="stable")
-    flat = shapely.force_2d(outlines[order])
+    lean = np.broadcast_to(np.asarray(lean, float), (len(ids), 2))
+    every = Sections(ids, outlines, planes, lean)
+    found = adjacent(every, np.ones(len(ids), bool), max(APART, hidden(lean)))
+    return named(ids, found, footprint)
+
+
+class Sections(NamedTuple):
+    """Sections: ids (n,), outlines (n,) in the map frame (m), planes (n, 5), lean of the view (n, 2)."""
+
+    ids: np.ndarray
+    outlines: np.ndarray
+    planes: np.ndarray
+    lean: np.ndarray
+
+    def take(self, rows: np.ndarray) -> Sections:
+        """Some of the sections."""
+        return Sections(*(column[rows] for column in self))
+
+
+class Adjacent(NamedTuple):
+    """Pairs (m, 2) of sections that touch, and whether their step and overlap let them be one building (m,)."""
+
+    pairs: np.ndarray
+    together: np.ndarray
+
+
+def adjacent(found: Sections, own: np.ndarray, reach: float) -> Adjacent:
+    """The pairs of sections that touch whose smaller id is one of the `own` (n,) bool, `reach` (m) apart at most."""
+    order = np.argsort(found.ids, kind="stable")
+    found = found.take(order)
+    flat = shapely.force_2d(found.outlines)
     flat = np.where(shapely.is_missing(flat), shapely.Polygon(), flat)
     whole = shapely.make_valid(flat)
-    lean = np.broadcast_to(np.asarray(lean, float), (len(ids), 2))[order]
-    reach = max(APART, hidden(lean))
     pairs = shapely.STRtree(whole).query(whole, predicate="dwithin", distance=reach).T
-    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
-    length, step = shared_edges(flat, planes[order], pairs, lean)
+    pairs = pairs[(pairs[:, 0] < pairs[:, 1]) & own[order[pairs[:, 0]]]]
+    length, step = shared_edges(flat, found.planes, pairs, found.lean)
     long = length >= SHARED
     together = long & (step <= STEP)
     rest = np.flatnonzero(~long)
-    together[rest] = _overlapping(whole, planes[order], pairs[rest])
+    together[rest] = _overlapping(whole, found.planes, pairs[rest])
     touching = long | together
+    return Adjacent(order[pairs[touching]], together[touching])
+
+
+def named(ids: np.ndarray, found: Adjacent, footprint: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Building id (n,) and cluster id (n,) of sections: the smallest id of those each is connected to."""
+    together = found.together
     if footprint is not None:
-        together &= footprint[order][pairs[:, 0]] == footprint[order][pairs[:, 1]]
-    return _named(ids, order, pairs[together]), _named(ids, order, pairs[touching])
+        together = together & (footprint[found.pairs[:, 0]] == footprint[found.pairs[:, 1]])
+    return _smallest(ids, found.pairs[together]), _smallest(ids, found.pairs)
 
 
-def _named(ids: np.ndarray, order: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """For each section the smallest id of those it is connected to; `pairs` (m, 2) number the sections in `order`."""
+def _smallest(ids: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     group = groups(len(ids), pairs)
     smallest = np.full(group.max(initial=-1) + 1, np.iinfo(np.int64).max)
-    np.minimum.at(smallest, group, ids[order])
-    result = np.empty(len(ids), np.int64)
-    result[order] = smallest[group]
-    return result
+    np.minimum.at(smallest, group, ids)
+    return smallest[group]
 
 
 def hidden(lean: Lean) -> float:
@@ -207,21 +243,102 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     facts = scene.read(args.scene)
     tiling = Tiling(args.tile, args.margin, args.block)
-    table = pa.concat_tables([store.read_table(path) for path in args.ground])
-    outlines = shapely.from_wkb(table["outline_map"].to_numpy(zero_copy_only=False), on_invalid="ignore")
-    planes = np.stack([table[name].to_numpy() for name in ("plane_a", "plane_b", "plane_c", "x0", "y0")], axis=1)
-    footprint = standing_in(outlines, read_footprints(args.footprints, facts.grid.crs)) if args.footprints else None
-    pixels = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False), on_invalid="ignore")
-    lean = facts.leans(middle_of(pixels, facts))
-    building, cluster = buildings(table["section_id"].to_numpy(), outlines, planes, lean, footprint)
-    table = table.append_column("building_id", pa.array(building)).append_column("cluster_id", pa.array(cluster))
-    table = table.sort_by([("building_id", "ascending"), ("section_id", "ascending")])
-    block_of = owner_blocks(table["cluster_id"].to_numpy(), facts.grid, tiling)
-    by_block = {}
-    for block in tiling.blocks(facts.grid.width, facts.grid.height):
-        mine = np.flatnonzero((block_of == (block.row, block.col)).all(axis=1))
-        by_block[block.name] = table.take(pa.array(mine))
-    store.write_by_block(args.out, by_block)
+    prints = read_footprints(args.footprints, facts.grid.crs) if args.footprints else None
+    known = numbers(args.ground, facts, prints)
+    building, cluster = named(known.ids, adjacency(args.ground, known), known.footprint)
+    names = {(block.row, block.col): block.name for block in tiling.blocks(facts.grid.width, facts.grid.height)}
+    block_of = owner_blocks(cluster, facts.grid, tiling)
+    schema = store.read_table(args.ground[0]).schema
+    more = {"building_id": building, "cluster_id": cluster}
+    table_of = functools.lru_cache(maxsize=KEPT)(store.read_table)
+    with store.by_block(args.out, pa.schema([*schema, *(pa.field(name, pa.int64()) for name in more)])) as append:
+        for place, name in names.items():
+            mine = np.flatnonzero((block_of == place).all(axis=1))
+            mine = mine[np.lexsort((known.ids[mine], building[mine]))]
+            append(name, _rows(mine, known, args.ground, table_of, schema, more))
+
+
+class Numbers(NamedTuple):
+    """What is known of the sections of all blocks while their outlines are not in memory.
+
+    `ids` (n,), `file` (n,) and `row` (n,): where each stands; `bounds` (n, 4) map m; `lean` (n, 2); `footprint` (n,) or None.
+    """
+
+    ids: np.ndarray
+    file: np.ndarray
+    row: np.ndarray
+    bounds: np.ndarray
+    lean: np.ndarray
+    footprint: np.ndarray | None
+
+
+def numbers(paths: list[str], facts: scene.Scene, footprints: np.ndarray | None) -> Numbers:
+    """Reads every block once."""
+    found = []
+    for k, path in enumerate(paths):
+        table = store.read_table(path, ["section_id", "outline", "outline_map"])
+        outlines, pixels = (_shapes(table[name]) for name in ("outline_map", "outline"))
+        n = len(table)
+        prints = np.zeros(n, int) if footprints is None else standing_in(outlines, footprints)
+        lean = np.broadcast_to(np.asarray(facts.leans(middle_of(pixels, facts)), float), (n, 2))
+        bounds = shapely.bounds(outlines).reshape(-1, 4)
+        found.append((table["section_id"].to_numpy(), np.full(n, k), np.arange(n), bounds, lean, prints))
+    ids, file, row, bounds, lean, prints = map(np.concatenate, zip(*found, strict=True))
+    return Numbers(ids, file, row, bounds, lean, None if footprints is None else prints)
+
+
+def adjacency(paths: list[str], known: Numbers) -> Adjacent:
+    """Which sections of all blocks touch (as rows of `known`): block after block, each with what is near it."""
+    reach = max(APART, hidden(known.lean))
+    block_of = functools.lru_cache(maxsize=KEPT)(_outlines_and_planes)
+    pairs, together = [np.zeros((0, 2), np.int64)], [np.zeros(0, bool)]
+    for k in range(len(paths)):
+        own = known.file == k
+        if not own.any():
+            continue
+        low, high = np.nanmin(known.bounds[own, :2], axis=0) - reach, np.nanmax(known.bounds[own, 2:], axis=0) + reach
+        near = own | ((known.bounds[:, :2] <= high) & (known.bounds[:, 2:] >= low)).all(axis=1)
+        rows = np.flatnonzero(near)
+        parts = []
+        for file in np.unique(known.file[rows]):
+            outlines, planes = block_of(paths[file])
+            mine = rows[known.file[rows] == file]
+            parts.append((mine, outlines[known.row[mine]], planes[known.row[mine]]))
+        rows, outlines, planes = map(np.concatenate, zip(*parts, strict=True))
+        found = adjacent(Sections(known.ids[rows], outlines, planes, known.lean[rows]), own[rows], reach)
+        pairs.append(rows[found.pairs])
+        together.append(found.together)
+    return Adjacent(np.concatenate(pairs), np.concatenate(together))
+
+
+def _shapes(column: pa.ChunkedArray) -> np.ndarray:
+    return shapely.from_wkb(column.to_numpy(zero_copy_only=False), on_invalid="ignore")
+
+
+def _outlines_and_planes(path: str) -> tuple[np.ndarray, np.ndarray]:
+    table = store.read_table(path, ["outline_map", *PLANE])
+    return _shapes(table["outline_map"]), np.column_stack([table[name].to_numpy() for name in PLANE])
+
+
+def _rows(
+    rows: np.ndarray,
+    known: Numbers,
+    paths: list[str],
+    table_of: Callable[[str], pa.Table],
+    schema: pa.Schema,
+    more: dict[str, np.ndarray],
+) -> pa.Table:
+    """Rows of `known` as a table, in that order, with more columns."""
+    parts, order = [schema.empty_table()], []
+    for file in np.unique(known.file[rows]):
+        mine = np.flatnonzero(known.file[rows] == file)
+        parts.append(table_of(paths[file]).take(pa.array(known.row[rows[mine]])))
+        order.append(mine)
+    place = np.argsort(np.concatenate([np.zeros(0, np.int64), *order]), kind="stable")
+    table = pa.concat_tables(parts).take(pa.array(place))
+    for name, values in more.items():
+        table = table.append_column(name, pa.array(values[rows]))
+    return table
 
 
 if __name__ == "__main__":
