@@ -43,19 +43,20 @@ def partition(
     planes: np.ndarray,
     reliable: np.ndarray,
     gap: float = GAP,
+    reach: float = REACH,
 ) -> Partition:
     """The faces of a building.
 
     `polygons`: n polygons (m, any validity); `planes`: (n, 3) coefficients of z = a·x + b·y + c in the same frame;
-    `reliable`: (n,) bool, whose height can be trusted; `gap` (m): widest gap between neighbours that do not fit.
-    Raises `NoPartition`.
+    `reliable`: (n,) bool, whose height can be trusted; `gap` (m): widest gap between neighbours that do not fit, `reach` (m): how
+    far apart what they share may be. Raises `NoPartition`.
     """
     cleaned = [polygonal(p) for p in polygons]
     if all(p.is_empty for p in cleaned):
         raise NoPartition("no section has an area")
-    faces, exact = _tile(cleaned, planes, reliable, EXACT, REACH)
+    faces, exact = _tile(cleaned, planes, reliable, EXACT, gap)
     if not exact:
-        faces, _ = _tile(cleaned, planes, reliable, REACH, gap)
+        faces, _ = _tile(cleaned, planes, reliable, reach, gap)
     if not faces:
         raise NoPartition("no section is wide enough to stand")
     return Partition(faces, exact)

@@ -27,7 +27,7 @@ from kibs_steps.view import Plane
 
 SHARED = 2.0  # px: a corner on a ridge or eave belongs to every section whose rim is as near, up to this
 SLOPE_PRIOR = 0.7  # standard deviation of a roof's gradient per axis: 35° is ordinary, 60° is rare
-SIGMA_FLOOR = 0.02  # m
+SIGMA_FLOOR = 0.1  # m: no roof is flatter than that
 TUKEY = 4.0  # residuals beyond 4 σ do not count
 COMMON = 0.7  # share of the height map's σ that all of a section has in common
 ENOUGH = 2  # cells of the height map that give a section its plane without corners

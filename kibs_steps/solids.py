@@ -25,7 +25,7 @@ from kibs_steps.buildings import hidden
 from kibs_steps.errors import KibsError
 from kibs_steps.faces import MM, Face, NoPartition, Point, directed_edges, dissolved, shapes_of
 from kibs_steps.features import roof_type
-from kibs_steps.partition import GAP, partition, polygonal
+from kibs_steps.partition import GAP, REACH, partition, polygonal
 from kibs_steps.planes import middle_of
 from kibs_steps.planes_together import SLOPE_CAP, bring_together, drawn_to_planes
 from kibs_steps.shells import GROUND, Surface
@@ -34,6 +34,10 @@ from kibs_steps.terrain import Terrain
 FITTED = ("ok", "raster_edge", "cloud_or_nodata")  # statuses whose plane was fitted to enough corners
 LOWEST_ROOF = 0.5  # m above the building's ground
 RAGGED = 1.3  # px, how far the rim of a traced section may be from its straight edge
+DRAWN = 0.3  # m, how well drawn outlines fit each other
+MEETING = 1.5  # px, outlines this near in the image meet there
+ALONG = 8.0  # px, longer common edges are no chance
+WHOLE = 10.0  # px², outlines over each other by more show parts that are hidden
 ONE_LEVEL = 0.1  # m, flat sections this near in height are one level
 CANNOT = (NoPartition, shapely.errors.GEOSException, np.linalg.LinAlgError, ValueError)  # what bad geometry ends in
 
@@ -47,7 +51,7 @@ class Sections(NamedTuple):
 
     Ids, polygons and planes (n, 3: z = a·x + b·y + c) in metres from `origin` (map m). `traced`: their outlines
     run from pixel corner to pixel corner, so their rims are ragged. `spread` (n,): σ of where they stand (m), NaN where the
-    view is unknown.
+    view is unknown. `seen` (n,): outlines in the image (px).
     """
 
     ids: np.ndarray
@@ -58,6 +62,7 @@ class Sections(NamedTuple):
     origin: tuple[int, int]
     traced: bool = False
     spread: np.ndarray | None = None
+    seen: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Sections:
         """Some of the sections."""
@@ -68,12 +73,21 @@ class Sections(NamedTuple):
             status=[self.status[k] for k in rows],
             sigma=self.sigma[rows],
             spread=None if self.spread is None else self.spread[rows],
+            seen=None if self.seen is None else self.seen[rows],
         )
 
     @property
     def fitted(self) -> np.ndarray:
         """(n,) bool: whose plane was fitted; the others are level placeholders."""
         return np.isin(self.status, FITTED)
+
+
+class Fit(NamedTuple):
+    """How well sections fit (m): what neighbours share may be `reach` apart, with a `gap` between; rims waver by `ragged`."""
+
+    reach: float = REACH
+    gap: float = GAP
+    ragged: float = straight.REACH
 
 
 class Solid(NamedTuple):
@@ -99,11 +113,29 @@ class Built(NamedTuple):
     solid: Solid
 
 
-def build(
-    sections: Sections, dtm: Terrain, lod_label: str = "2.0", gap: float = GAP, reach: float = straight.REACH
-) -> Solid:
+def fit_of(sections: Sections, lean: np.ndarray, gsd: float) -> Fit:
+    """How well the sections of a cluster fit: as their outlines were made; `lean` (n, 2) of the view, `gsd` in m.
+
+    Traced outlines gape by all that a step can hide. Drawn ones are trusted. If some overlap in the image they were drawn whole,
+    hidden parts too, and all gaps are real. Else a strip was hidden between sections that run along each other in the image
+    and stand apart on the map; other gaps are seen, and so real.
+    """
+    if sections.traced or sections.seen is None:
+        return Fit(gap=max(GAP, hidden(lean)), ragged=RAGGED * gsd)
+    seen, standing = (shapely.make_valid(np.array(p, object)) for p in (sections.seen, sections.polygons))
+    a, b = shapely.STRtree(seen).query(seen, "dwithin", MEETING)
+    a, b = a[a < b], b[a < b]
+    if shapely.area(shapely.intersection(seen[a], seen[b])).max(initial=0.0) > WHOLE:
+        return Fit(DRAWN, DRAWN, 0.0)
+    along = shapely.length(shapely.intersection(shapely.boundary(seen[a]), shapely.buffer(seen[b], MEETING)))
+    apart = shapely.distance(standing[a], standing[b])[along > ALONG]
+    widest = min(float(apart.max(initial=0.0)), hidden(lean))
+    return Fit(DRAWN, widest + DRAWN, 0.0)
+
+
+def build(sections: Sections, dtm: Terrain, lod_label: str = "2.0", fit: Fit | None = None) -> Solid:
     """The most detailed valid solid of a building that stands alone; never raises on geometry."""
-    ((_, _, solid),) = together(sections, np.zeros(len(sections.ids), np.int64), dtm, lod_label, gap, reach)
+    ((_, _, solid),) = together(sections, np.zeros(len(sections.ids), np.int64), dtm, lod_label, fit)
     return solid
 
 
@@ -112,22 +144,22 @@ def together(
     building: np.ndarray,
     dtm: Terrain,
     lod_label: str = "2.0",
-    gap: float = GAP,
-    reach: float = straight.REACH,
+    fit: Fit | None = None,
 ) -> list[Built]:
     """The most detailed valid solids of buildings that touch, tiled as one so that they share their party walls.
 
-    `building` (n,): building of each section; `gap` (m) as in `partition.partition`, `reach` (m) as in `straight.ragged`.
+    `building` (n,): building of each section.
     Never raises on geometry: what cannot be tiled together is tried alone.
     """
+    fit = fit or Fit()
     names = np.unique(building)
     of = {int(b): np.flatnonzero(building == b) for b in names}
     try:
-        faces = _tiled(sections, building, gap, reach)
+        faces = _tiled(sections, building, fit)
     except CANNOT as error:
         if len(names) > 1:
             return [
-                Built(b, mine, build(mine, dtm, lod_label, gap, reach))
+                Built(b, mine, build(mine, dtm, lod_label, fit))
                 for b, mine in ((b, sections.take(rows)) for b, rows in of.items())
             ]
         return [Built(int(names[0]), sections, _undivided(sections, dtm, lod_label, error))]
@@ -139,7 +171,7 @@ def together(
         own = [Face(place[f.section], f.rings) for f in faces if f.section in place]
         if not own:
             found.append(
-                Built(b, mine, build(mine, dtm, lod_label, gap, reach) if len(names) > 1 else _nothing(mine, dtm, []))
+                Built(b, mine, build(mine, dtm, lod_label, fit) if len(names) > 1 else _nothing(mine, dtm, []))
             )
             continue
         party = frozenset(
@@ -151,12 +183,12 @@ def together(
     return found
 
 
-def _tiled(sections: Sections, building: np.ndarray, gap: float, reach: float) -> list[Face]:
+def _tiled(sections: Sections, building: np.ndarray, fit: Fit) -> list[Face]:
     """The faces of buildings that touch: as they are where they fit, else with straight rims."""
-    faces, exact = partition(sections.polygons, sections.planes, sections.fitted, gap)
-    if exact and not sections.traced:
+    faces, exact = partition(sections.polygons, sections.planes, sections.fitted, fit.gap, fit.reach)
+    if (exact and not sections.traced) or not fit.ragged:
         return straight.tidied(faces)
-    return drawn_to_planes(straight.ragged(faces, reach, building), sections.planes)
+    return drawn_to_planes(straight.ragged(faces, fit.ragged, building), sections.planes)
 
 
 def _climb(faces: list[Face], sections: Sections, dtm: Terrain, lod_label: str) -> Solid:
@@ -352,9 +384,12 @@ def clusters_of(table: pa.Table) -> Iterator[tuple[np.ndarray, Sections]]:
         near = [g and shapely.transform(shapely.force_2d(g), lambda xy, o=origin: xy - o) for g in outlines[mine]]
         place = (int(origin[0]), int(origin[1]))
         corners = shapely.get_coordinates(pixels[mine])
-        traced = bool(len(corners)) and bool((corners == np.round(corners)).all())
+        traced = bool(len(corners)) and bool((corners == np.round(corners)).all(axis=1).mean() > 0.5)
         spread = np.hypot(along[mine], across[mine])
-        yield building[mine], Sections(ids[mine], near, planes, status[mine], sigma[mine], place, traced, spread)
+        yield (
+            building[mine],
+            Sections(ids[mine], near, planes, status[mine], sigma[mine], place, traced, spread, pixels[mine]),
+        )
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -380,8 +415,8 @@ def main(argv: list[str] | None = None) -> None:
     lean = dict(zip(table["section_id"].to_pylist(), facts.leans(middle_of(pixels, facts)), strict=True))
     built = []
     for building, sections in clusters:
-        gap = max(GAP, hidden(np.array([lean[k] for k in sections.ids.tolist()])))
-        built += together(sections, building, dtm, args.lod_label, gap, RAGGED * grid.gsd)
+        fit = fit_of(sections, np.array([lean[k] for k in sections.ids.tolist()]), grid.gsd)
+        built += together(sections, building, dtm, args.lod_label, fit)
     rows, triangles = [], []
     with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
         out.write(json.dumps(features.header(datum), separators=(",", ":")) + "\n")

@@ -60,6 +60,14 @@ def test_one_wild_corner_is_outvoted():
     assert np.abs(plain - SLOPE.at(xy)).max() > 1.0
 
 
+def test_a_slightly_warped_roof_keeps_all_its_corners():
+    """Four exact corners, one 0.3 m off their plane: no corner is thrown away, the plane halves the warp on all of them."""
+    z = SLOPE.at(SQUARE)
+    z[2] += 0.3
+    plane, _ = planes.robust_plane(points(np.column_stack([SQUARE, z]), 0.01), MIDDLE)
+    assert np.abs(plane.at(SQUARE) - z).max() == pytest.approx(0.075, abs=0.01)
+
+
 def test_sigma_matches_spread_of_repeated_fits():
     """The σ of the height at the middle is what repeated noisy fits scatter by."""
     rng = np.random.default_rng(1)

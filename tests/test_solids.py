@@ -387,3 +387,34 @@ def test_a_block_is_written_with_attributes_and_semantics(tmp_path):
     assert sorted(s["section_id"] for s in roofs) == [5, 7, 9, 11]
     assert {(s["status"], s["height_sigma"]) for s in roofs} == {("ok", 0.2)}
     assert [round(s["slope"], 1) for s in roofs] == [36.9] * 4
+
+
+def drawn(seen, apart, z=(9.0, 3.0)):
+    """A high section and a low one west of it, `apart` m on the map; `seen` are their columns in the image (px)."""
+    east, west = shapely.box(10, 0, 20, 10), shapely.box(0 - apart, 0, 10 - apart, 10)
+    return solids.Sections(
+        np.array([1, 2]),
+        [east, west],
+        np.array([[0.0, 0.0, z[0]], [0.0, 0.0, z[1]]]),
+        ["ok", "ok"],
+        np.full(2, 0.1),
+        (0, 0),
+        seen=np.array([shapely.box(a, 0.5, b, 20.5) for a, b in seen], object),
+    )
+
+
+@pytest.mark.parametrize(
+    ("seen", "apart", "closed"),
+    [
+        (((20.25, 40.25), (0.25, 20.25)), 1.2, True),  # they meet in the image: the step hid the strip
+        (((20.25, 40.25), (-3.75, 16.25)), 1.2, False),  # an alley is seen between them
+        (((20.25, 40.25), (2.25, 22.25)), 1.2, False),  # drawn whole, with what the high one hides: the alley is real
+    ],
+)
+def test_a_gap_between_drawn_sections_is_closed_only_where_a_step_hid_it(seen, apart, closed):
+    sections = drawn(seen, apart)
+    fit = solids.fit_of(sections, np.array([[1.0, 0.0]] * 2), 0.38)
+    one = solids.build(sections, FLAT, fit=fit)
+    footprint = sum(shapely.area(shapely.get_parts(one.base)))
+    assert footprint == pytest.approx(200.0 + (10 * apart if closed else 0.0), abs=0.1)
+    assert shells_are_valid(one)

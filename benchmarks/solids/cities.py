@@ -159,10 +159,10 @@ def built(city: World, sections: pa.Table, corners: pa.Table) -> tuple[list[tupl
     flat = np.stack([table[n].to_numpy() for n in ("plane_a", "plane_b", "plane_c", "x0", "y0")], axis=1)
     building, cluster = buildings.buildings(table["section_id"].to_numpy(), outlines, flat, facts.lean)
     table = table.append_column("building_id", pa.array(building)).append_column("cluster_id", pa.array(cluster))
-    gap = max(solids.GAP, buildings.hidden(facts.lean))
     found = []
     for names, some in solids.clusters_of(table):
-        for name, mine, solid in solids.together(some, names, dtm, "2.0", gap, solids.RAGGED * facts.grid.gsd):
+        fit = solids.fit_of(some, np.array([facts.lean]), facts.grid.gsd)
+        for name, mine, solid in solids.together(some, names, dtm, "2.0", fit):
             found.append((features.attributes(name, mine, solid), mine, solid))
     return found, time.process_time() - started
 

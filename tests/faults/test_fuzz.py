@@ -180,12 +180,12 @@ def cities(number: int, first: int = 0) -> tuple[int, int]:
         standing = standing.append_column("building_id", pa.array(owner))
         standing = standing.append_column("cluster_id", pa.array(cluster))
         standing = standing.sort_by([("building_id", "ascending"), ("section_id", "ascending")])
-        gap = max(solids.GAP, solids.hidden(np.array([FACTS.lean])))
-        rag = solids.RAGGED * FACTS.grid.gsd
         made = [
             one.solid
             for owners, cluster in solids.clusters_of(standing)
-            for one in solids.together(cluster, owners, dtm, "2.0", gap, rag)
+            for one in solids.together(
+                cluster, owners, dtm, "2.0", solids.fit_of(cluster, np.array([FACTS.lean]), FACTS.grid.gsd)
+            )
         ]
         for one in made:
             for shell in one.shells:
