@@ -11,11 +11,16 @@ import shapely
 from kibs_steps import features, gate, solids, terrain
 from kibs_steps.shells import ROOF, WALL
 
+try:
+    import by_cgal
+except ImportError:
+    by_cgal = None
+
 FLAT = terrain.flat(0.0)
 
 
 def made(polygons, planes, building=None, status=None, **how):
-    """Solids (by building) of sections, each held against the independent gate."""
+    """Solids (by building) of sections, each held against the independent gate and CGAL."""
     n = len(polygons)
     building = np.zeros(n, int) if building is None else np.asarray(building)
     sections = solids.Sections(
@@ -36,6 +41,8 @@ def made(polygons, planes, building=None, status=None, **how):
             for geometry in thing.get("geometry", []):
                 if geometry["type"] == "Solid":
                     assert independent.faults(geometry["boundaries"][0], xyz) == []
+                    if by_cgal is not None:
+                        assert by_cgal.faults(geometry["boundaries"][0], xyz) == []
         json.dumps(feature, allow_nan=False)
         found[name] = row, solid
     return found
@@ -52,6 +59,17 @@ def level(*heights):
 
 def ring(house):
     return [shapely.Polygon(r) for r, _ in house], [p for _, p in house]
+
+
+@pytest.mark.skipif(by_cgal is None, reason="cgal is not installed")
+def test_cgal_refuses_what_is_broken():
+    xyz = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
+    cube = [[[3, 2, 1, 0]], [[4, 5, 6, 7]], [[0, 1, 5, 4]], [[1, 2, 6, 5]], [[2, 3, 7, 6]], [[3, 0, 4, 7]]]
+    assert by_cgal.faults(cube, xyz) == []
+    assert by_cgal.faults(cube[1:], xyz) == ["not closed"]
+    assert "looks inward" in by_cgal.faults([[r[0][::-1]] for r in cube], xyz)
+    pushed = np.vstack([xyz, xyz * 0.5 + (0.4, 0.4, 0.7)])
+    assert "cuts itself" in by_cgal.faults(cube + [[[v + 8 for v in r[0]]] for r in cube], pushed)
 
 
 def test_the_independent_gate_refuses_what_is_broken():

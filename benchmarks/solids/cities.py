@@ -22,6 +22,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import by_cgal
 import independent
 import numpy as np
 import pyarrow as pa
@@ -175,7 +176,9 @@ def measured(city: World, found: list[tuple[dict, Any, Any]], seconds: float) ->
         xyz = np.array(feature["vertices"], float).reshape(-1, 3) / MM
         for thing in feature["CityObjects"].values():
             for geometry in thing.get("geometry", []):
-                faulty += geometry["type"] == "Solid" and bool(independent.faults(geometry["boundaries"][0], xyz))
+                if geometry["type"] == "Solid":
+                    shell = geometry["boundaries"][0]
+                    faulty += bool(independent.faults(shell, xyz) or by_cgal.faults(shell, xyz))
     lods = Counter(row["lod"] for row, _, _ in found)
     good = [row for row, mine, _ in found if "ok" in mine.status]
     full = [r for r in good if r["lod"] == "2.0" and (r["faithful"] is None or r["faithful"] >= 0.9)]

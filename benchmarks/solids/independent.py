@@ -46,7 +46,7 @@ def faults(faces: list[list[list[int]]], xyz: np.ndarray) -> list[str]:
             edges.update(zip(ring, [*ring[1:], ring[0]], strict=True))
     wrong = [f"edge {e} used {n} times" for e, n in edges.items() if n != 1]
     wrong += [f"edge {e} has no twin" for e in edges if e[::-1] not in edges]
-    triangles, owner = [], []
+    pieces, owner = [], []
     for f, rings in enumerate(faces):
         points = xyz[[v for ring in rings for v in ring]]
         centre = points.mean(axis=0)
@@ -54,12 +54,12 @@ def faults(faces: list[list[list[int]]], xyz: np.ndarray) -> list[str]:
         off = np.abs((points - centre) @ axes[2]).max()
         if off > FLAT:
             wrong.append(f"face {f} is {off:.4f} m off its plane")
-        found = _triangles(rings, xyz)
-        triangles += found
+        found = triangles(rings, xyz)
+        pieces += found
         owner += [f] * len(found)
     if wrong:
         return wrong
-    index = np.array(triangles)
+    index = np.array(pieces)
     corner = xyz[index] - xyz[index[0, 0]]
     volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])).sum() / 6
     if volume <= 0:
@@ -67,7 +67,7 @@ def faults(faces: list[list[list[int]]], xyz: np.ndarray) -> list[str]:
     return wrong + _cuts(index, corner, np.array(owner))
 
 
-def _triangles(rings: list[list[int]], xyz: np.ndarray) -> list[tuple[int, int, int]]:
+def triangles(rings: list[list[int]], xyz: np.ndarray) -> list[tuple[int, int, int]]:
     """A face as triangles of its own vertices, turned as the face is."""
     area = sum(np.cross(xyz[r], np.roll(xyz[r], -1, axis=0)).sum(axis=0) for r in rings)
     drop = int(np.abs(area).argmax())
