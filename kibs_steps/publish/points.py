@@ -35,9 +35,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", required=True, help="out: points.txt")
     args = parser.parse_args(argv)
     columns = ["section_id", "outline_map", "split"]
-    corners, split = points(pa.concat_tables([store.read_table(path, columns) for path in args.sections]))
-    with store.whole(args.out) as temporary:
-        np.savetxt(temporary, np.column_stack([corners, split]), fmt=("%.3f", "%.3f", "%.3f", "%d"))
+    with store.whole(args.out) as temporary, temporary.open("w", encoding="ascii") as out:
+        for some in store.merged(args.sections, ["section_id"], columns):
+            for (x, y, z), split in zip(*(column.tolist() for column in points(some)), strict=True):
+                out.write(f"{x:.3f} {y:.3f} {z:.3f} {split}\n")
 
 
 if __name__ == "__main__":

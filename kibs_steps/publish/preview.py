@@ -8,6 +8,9 @@ taller ones casting a longer shadow. Both panels show the same ground at the sam
 from __future__ import annotations
 
 import argparse
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +24,8 @@ from kibs_steps.picture import FINER
 from kibs_steps.scene import Scene
 
 LONGEST = 1200  # px: longer side of a panel
+UNSEEN = 0.1  # picture pixels: what is finer than this nobody sees
+VALUES = ("slope", "azimuth", "plane_a", "plane_b", "height_mean")
 LIGHT = np.array([-0.5, 0.5, 0.7])  # towards the lamp of the shaded map: north-west, as maps have it
 COLUMNS = [
     "section_id",
@@ -124,24 +129,46 @@ def compass(page: Image.Image, centre: tuple[int, int], radius: int) -> None:
         pen.text(place, name, font=picture.font(11), fill=picture.QUIET, anchor="mm")
 
 
-def preview(scene: Scene, sections: pa.Table) -> Image.Image:
-    """The whole picture of a scene's sections (`buildings.parquet`)."""
+class Shown(NamedTuple):
+    """What the picture shows of the sections, in order of ids: outlines as seen (px) and as they stand (map m), no finer than it
+    can show, their areas (px), buildings, and numbers by name."""
+
+    seen: NDArray[np.object_]
+    standing: NDArray[np.object_]
+    area: NDArray[np.float64]
+    building: NDArray[np.int64]
+    value: dict[str, NDArray[np.float64]]
+
+
+def shown(tables: Iterable[pa.Table], scale: float, gsd: float) -> Shown:
+    """Reads sections (`buildings.parquet`), some at a time; `scale` is picture pixels per pixel of the grid."""
+    kept: dict[str, list[NDArray]] = defaultdict(list)
+    for some in tables:
+        for name, finest in (("outline", UNSEEN / scale), ("outline_map", UNSEEN / scale * gsd)):
+            shapes = shapely.from_wkb(some[name].to_numpy())
+            if name == "outline":
+                kept["area"].append(shapely.area(shapes))
+            kept[name].append(shapely.simplify(shapely.force_2d(shapes), finest))
+        kept["building"].append(some["building_id"].to_numpy())
+        for name in VALUES:
+            kept[name].append(some[name].to_numpy().astype(float))
+    found = {name: np.concatenate(parts) for name, parts in kept.items()}
+    numbers = {name: found[name] for name in VALUES}
+    return Shown(found["outline"], found["outline_map"], found["area"], found["building"], numbers)
+
+
+def preview(scene: Scene, tables: Iterable[pa.Table]) -> Image.Image:
+    """The whole picture of a scene's sections (`buildings.parquet`, in order of ids)."""
     rgb, scale = picture.overview(scene, LONGEST)
-    seen = shapely.from_wkb(sections["outline"].to_numpy())
-    standing = shapely.from_wkb(sections["outline_map"].to_numpy())
-    value = {
-        name: sections[name].to_numpy().astype(float)
-        for name in ("slope", "azimuth", "plane_a", "plane_b", "height_mean")
-    }
+    seen, standing, area, building, value = shown(tables, scale, scene.grid.gsd)
     facing = picture.directions(value["slope"], value["azimuth"])
-    typical = np.sqrt(np.median(shapely.area(seen))) * scale if len(seen) else 10.0
+    typical = np.sqrt(np.median(area)) * scale if len(seen) else 10.0
     width = float(np.clip(typical / 18, 0.5, 1.6))  # thin lines over many small roofs
     left = picture.paint(rgb, seen, facing, scale, cover=0.42, width=width)
     gradients = np.column_stack([value["plane_a"], value["plane_b"]])
     right, top = standing_panel(scene, standing, gradients, value["height_mean"], left.size, scale)
 
-    buildings = len(np.unique(sections["building_id"].to_numpy())) if "building_id" in sections.column_names else 0
-    note = f"{len(seen):,} roof sections" + (f", {buildings:,} buildings" if buildings else "")
+    note = f"{len(seen):,} roof sections" + (f", {len(np.unique(building)):,} buildings" if len(seen) else "")
     titles = ["as seen from the satellite", "where they stand"]
     page = picture.sheet([left, right], titles, scene.name, note, foot=76)
     pen = ImageDraw.Draw(page)
@@ -160,9 +187,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
     parser.add_argument("--out", required=True, help="out: preview.png")
     args = parser.parse_args(argv)
-    tables = [store.read_table(path, COLUMNS) for path in args.sections]
-    sections = pa.concat_tables(tables, promote_options="permissive").sort_by("section_id")
-    picture.write(args.out, preview(scenes.read(args.scene), sections))
+    picture.write(args.out, preview(scenes.read(args.scene), store.merged(args.sections, ["section_id"], COLUMNS)))
 
 
 if __name__ == "__main__":
