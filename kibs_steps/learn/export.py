@@ -116,6 +116,12 @@ def export(model: nn.Module, path: str | Path, contract: dict[str, Any]) -> None
         onnx.save(proto, str(temporary))
 
 
+def halved(average: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Weights in half precision; what that cannot hold (variances of wide features) stays as it is."""
+    halves = {name: value.half() if value.is_floating_point() else value for name, value in average.items()}
+    return {name: half if torch.isfinite(half).all() else average[name] for name, half in halves.items()}
+
+
 def main(argv: list[str] | None = None) -> None:
     """Export the averaged weights of a run as the model of one task."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.export", description=main.__doc__)
@@ -151,9 +157,8 @@ def main(argv: list[str] | None = None) -> None:
         heights = corner_height_moments(Path(args.pool))
     export(model, args.out, contract_of(task, heights, settings.family, **facts))
     if args.weights:
-        halves = {k: v.half() if v.is_floating_point() else v for k, v in average.items()}
         with store.whole(args.weights, summed=False) as temporary:
-            torch.save({"average": halves, "settings": state["settings"]}, temporary)
+            torch.save({"average": halved(average), "settings": state["settings"]}, temporary)
     print(f"{args.out}: {state['step']} steps, {state['seconds'] / 60:.0f} min")
 
 

@@ -154,8 +154,12 @@ def moved(batch: Any, device: torch.device) -> Any:
 
 
 def start_from(model: nn.Module, checkpoint: str | Path) -> None:
-    """Fills a network with the averaged weights of another run."""
-    model.load_state_dict(torch.load(checkpoint, weights_only=True, map_location="cpu")["average"])
+    """Fills a network with the averaged weights of another run. Raises `ContractMismatch` where they are no numbers."""
+    average = torch.load(checkpoint, weights_only=True, map_location="cpu")["average"]
+    bad = [name for name, value in average.items() if not torch.isfinite(value).all()]
+    if bad:
+        raise ContractMismatch(f"{checkpoint}: {bad[0]} is not finite: start from other weights")
+    model.load_state_dict(average)
 
 
 def learning_rate(used: float, top: float) -> float:

@@ -38,3 +38,10 @@ def test_onnx_equals_torch(task, tmp_path):
         np.testing.assert_allclose(outputs["height"].sum(0), 1, atol=1e-4)
         assert (np.abs(outputs["offset"]) <= 0.5).all()
         heads.decode_corners(outputs, contract)
+
+
+def test_weights_too_large_for_half_precision_are_kept():
+    average = {"small": torch.tensor([0.5, 3.0]), "wide": torch.tensor([1.0, 80_000.0]), "steps": torch.tensor(7)}
+    kept = export.halved(average)
+    assert kept["small"].dtype == torch.float16
+    assert all(torch.equal(kept[name].to(value.dtype), value) for name, value in average.items())

@@ -100,6 +100,15 @@ def test_a_new_run_takes_over_the_weights_of_another(tmp_path):
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
 
 
+def test_weights_that_are_no_numbers_are_refused(tmp_path):
+    model = training.network()
+    average = model.state_dict()
+    average["bottleneck.1.running_var"][3] = float("inf")
+    torch.save({"average": average}, tmp_path / "weights.pt")
+    with pytest.raises(ContractMismatch, match=r"bottleneck\.1\.running_var is not finite"):
+        training.start_from(training.network(), tmp_path / "weights.pt")
+
+
 def test_geometry_changes_the_answer_once_learned():
     model = Dense(4, "corners").eval()
     for part in model.modulation:
