@@ -296,7 +296,7 @@ def adjacency(paths: list[str], known: Numbers) -> Adjacent:
         own = known.file == k
         if not own.any():
             continue
-        low, high = np.nanmin(known.bounds[own, :2], axis=0) - reach, np.nanmax(known.bounds[own, 2:], axis=0) + reach
+        low, high = np.fmin.reduce(known.bounds[own, :2]) - reach, np.fmax.reduce(known.bounds[own, 2:]) + reach
         near = own | ((known.bounds[:, :2] <= high) & (known.bounds[:, 2:] >= low)).all(axis=1)
         rows = np.flatnonzero(near)
         parts = []

@@ -14,7 +14,8 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
 from kibs_steps import store, sums
 
-FORMAT = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "zstd", "zstd_level": 1}
+FORMAT = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256}
+FORMAT |= {"compress": "zstd", "zstd_level": 1, "predictor": 2}
 
 
 def write(path: str | Path, image: np.ndarray, crs: str | None = None, transform: Affine | None = None) -> None:

@@ -122,7 +122,7 @@ def fit_of(sections: Sections, lean: np.ndarray, gsd: float) -> Fit:
     """
     if sections.traced or sections.seen is None:
         return Fit(gap=max(GAP, hidden(lean)), ragged=RAGGED * gsd)
-    seen, standing = (shapely.make_valid(np.array(p, object)) for p in (sections.seen, sections.polygons))
+    seen, standing = (np.array([polygonal(p) for p in some], object) for some in (sections.seen, sections.polygons))
     a, b = shapely.STRtree(seen).query(seen, "dwithin", MEETING)
     a, b = a[a < b], b[a < b]
     if shapely.area(shapely.intersection(seen[a], seen[b])).max(initial=0.0) > WHOLE:

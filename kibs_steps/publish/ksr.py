@@ -22,8 +22,8 @@ from kibs_steps import cli, store, view
 from kibs_steps import scene as scenes
 from kibs_steps.mesh import KINDS, Mesh, area_vectors, meshes, polygons
 
-STEP = 0.75  # m
-APART = 1.0  # m
+STEP = 1.0  # m
+APART = 2.0  # m
 AROUND = 8.0  # m
 SIDE = 256  # m, of the squares that the terrain is worked on in
 HEAD = 512  # bytes
