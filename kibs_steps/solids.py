@@ -148,7 +148,7 @@ def together(
 ) -> list[Built]:
     """The most detailed valid solids of buildings that touch, tiled as one so that they share their party walls.
 
-    `building` (n,): building of each section.
+    `building` (n,): building of each section; `fit`: how well they fit (`fit_of`).
     Never raises on geometry: what cannot be tiled together is tried alone.
     """
     fit = fit or Fit()
