@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> None:
     labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
     blended = {
         (t.row, t.col): blend(
-            sections.padded(rgb, sections.window_in_block(tiling.window(t), core, tiling.margin)),
+            sections.tile_image(rgb, t, tiling, core, facts.grid),
             labels[t.row, t.col],
             **contract["blend"],
         )

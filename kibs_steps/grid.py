@@ -29,6 +29,12 @@ class Window(NamedTuple):
         """The window with `margin` px more on all four sides."""
         return Window(self.col - margin, self.row - margin, self.width + 2 * margin, self.height + 2 * margin)
 
+    def within(self, grid: Grid) -> Window:
+        """The part of the window that lies in a grid."""
+        col, row = max(self.col, 0), max(self.row, 0)
+        right, bottom = min(self.col + self.width, grid.width), min(self.row + self.height, grid.height)
+        return Window(col, row, right - col, bottom - row)
+
 
 class Grid(NamedTuple):
     """The model grid: CRS (projected, metres), upper-left corner (m), GSD (m/px), size (px)."""

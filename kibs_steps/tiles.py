@@ -1,8 +1,9 @@
 """Tiles: the part of the raster one block looks at, as 8-bit RGB on the model grid.
 
 In: `scene.json` and the raster, of which only the block's window is read. Out: `tiles.tif`, RGBA of the block's core grown
-by the margin; A = 0 where there is no data. Networks must see no black frames, so colour goes on beyond the data: outside
-the grid its outermost pixels are repeated, inside it pixels within 32 px of data take the nearest colour.
+by the margin; A = 0 where there is no data. Networks must see no black frames, so colour goes on beyond the data: pixels
+within 32 px of data take the nearest colour, and so do those of the margin outside the grid (`sections.tile_image` shows
+networks a mirror image there).
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ def read_block(scene: Scene, tiling: Tiling, block: Block) -> tuple[np.ndarray, 
 
 def read_window(scene: Scene, window: Window) -> tuple[np.ndarray, np.ndarray]:
     """As `read_block`, any window that meets the grid."""
-    inside = _within(window, scene.grid)
-    read = _within(inside.grown(FILL), scene.grid)
+    inside = window.within(scene.grid)
+    read = inside.grown(FILL).within(scene.grid)
     with imagery.opened(scene.raster) as source:
         values, valid = _values(source, scene, read)
     rgb = imagery.stretched(values, scene.stretch)
@@ -58,12 +59,6 @@ def read_window(scene: Scene, window: Window) -> tuple[np.ndarray, np.ndarray]:
     )
     rgb = np.pad(rgb, ((0, 0), *beyond), mode="edge")
     return np.ascontiguousarray(rgb.transpose(1, 2, 0)), np.pad(valid, beyond)
-
-
-def _within(window: Window, grid: Grid) -> Window:
-    col, row = max(window.col, 0), max(window.row, 0)
-    right, bottom = min(window.col + window.width, grid.width), min(window.row + window.height, grid.height)
-    return Window(col, row, right - col, bottom - row)
 
 
 def _values(source: rasterio.DatasetReader, scene: Scene, window: Window) -> tuple[np.ndarray, np.ndarray]:

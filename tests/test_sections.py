@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from kibs_steps import sections
-from kibs_steps.grid import Tiling
+from kibs_steps.grid import Grid, Tiling
 
 SIDE, MARGIN = 64, 8
 TILING = Tiling(SIDE, MARGIN, 2)
@@ -33,3 +33,29 @@ def test_sections_of_a_burnt_out_tile_are_void(share, white, flagged):
     assert len(table) == 4
     assert table["void"].to_pylist() == [bool(flagged), False, False, False]
     assert all(shapely.from_wkb(wkb).area == 100 for wkb in table["outline"].to_pylist())
+
+
+@pytest.mark.parametrize("size", [(96, 96), (100, 51), (50, 49), (7, 143)])
+def test_networks_see_a_mirror_image_beyond_the_raster(size):
+    """Whatever the cut into blocks; numpy's symmetric padding of a tile's own part is the truth."""
+    width, height = size
+    grid = Grid("EPSG:32631", 0.0, 0.0, 0.38, width, height)
+    picture = np.arange(height * width).reshape(height, width, 1)
+    around = np.pad(picture, ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)), constant_values=-1)
+    for blocks in (1, 2, 3):
+        tiling = Tiling(SIDE, MARGIN, blocks)
+        for place in tiling.blocks(width, height):
+            core = tiling.block_core(place, width, height)
+            part = np.s_[core.row : core.row + core.height + 2 * MARGIN, core.col : core.col + core.width + 2 * MARGIN]
+            valid = np.pad(np.ones(size[::-1], bool), MARGIN)[part]
+            for tile, seen, data in sections.tile_images(around[part], valid, tiling, place, grid):
+                window = tiling.window(tile)
+                inside = window.within(grid)
+                own = picture[inside.row : inside.row + inside.height, inside.col : inside.col + inside.width]
+                before = inside.row - window.row, inside.col - window.col
+                after = SIDE - before[0] - inside.height, SIDE - before[1] - inside.width
+                expected = np.pad(own, (*zip(before, after, strict=True), (0, 0)), mode="symmetric")
+                assert (seen == expected).all()
+                rows, cols = np.nonzero(data)
+                assert (rows.min(), cols.min()) == before
+                assert data.sum() == inside.height * inside.width

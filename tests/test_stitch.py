@@ -50,8 +50,7 @@ def detections(image, block_side, nets, shuffle=None, tolerance=0.0):
         network, terms = nets["corners"]
         tables, cells = [], [heightmap.HEIGHTS.empty_table()]
         for view in views:
-            place = sections.window_in_block(tiling.window(view.tile), core, toy.MARGIN)
-            rgb = sections.padded(padded[window], place)
+            rgb = sections.tile_image(padded[window], view.tile, tiling, core, grid)
             outputs = network(rgb)
             tables.append(corners.of_tile(heads.decode_corners(outputs, terms), view.tile, tiling))
             cells.append(corners.heights_of_tile(heads.height_map(outputs, terms), view.labels, view.tile, tiling))

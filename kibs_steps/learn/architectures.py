@@ -170,6 +170,20 @@ class Convolution(nn.Sequential):
         )
 
 
+class Residual(nn.Module):
+    """Two convolutions added to what they see; neutral at the start."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.first = Convolution(channels, channels)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.norm = _norm(channels)
+        nn.init.zeros_(self.norm.weight)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x + self.norm(self.second(self.first(x)))
+
+
 class Modulation(nn.Module):
     """Scales and shifts each channel by what the geometry says (FiLM, Perez et al. 2018); neutral at the start."""
 
@@ -241,13 +255,14 @@ class Heights(nn.Module):
 
 
 class Dense(nn.Module):
-    """One network for both tasks; `forward` gives the maps of one `task`, in the order of OUTPUTS[task].
+    """A network for one task or both; `forward` gives the maps of its `task`, in the order of OUTPUTS[task].
 
     The image itself joins at stride 2 with its 2×2 pixels as channels, and the maps leave by a pixel shuffle, so lines one
     pixel wide survive at the cost of stride 2.
     """
 
     widths = (32, 40, 48, 64, 96)  # decoder channels at strides 2, 4, 8, 16, 32
+    depths = (1, 2, 1, 1)  # residuals at strides 2, 4, 8, 16
 
     def __init__(self, bins: int, task: str = "both"):
         super().__init__()
@@ -260,6 +275,10 @@ class Dense(nn.Module):
         joined = [self.encoder.channels[0] + 8, *self.encoder.channels[1:4]]
         self.decoder = nn.ModuleList(Convolution(self.widths[i + 1] + joined[i], self.widths[i]) for i in range(4))
         self.modulation = nn.ModuleList(Modulation(32, width) for width in self.widths)
+        self.deeper = nn.ModuleList(
+            nn.Sequential(*(Residual(width) for _ in range(depth)))
+            for width, depth in zip(self.widths, self.depths, strict=False)
+        )
         self.refine = Convolution(self.widths[0], self.widths[0])
         self.maps = nn.Sequential(nn.Conv2d(self.widths[0], 4 * sum(CHANNELS.values()), 1), nn.PixelShuffle(2))
         bias = self.maps[0].bias.data
@@ -282,12 +301,13 @@ class Dense(nn.Module):
         for i in (3, 2, 1, 0):
             x = F.interpolate(x, scale_factor=2.0, mode="nearest")
             x = self.modulation[i](self.decoder[i](torch.cat([x, features[i]], dim=1)), g)
+            x = self.deeper[i](x)
             if i == 1:
                 stride_4 = x
         maps = torch.split(self.maps(self.refine(x)), list(CHANNELS.values()), dim=1)
         raw = dict(zip(CHANNELS, maps, strict=True))
+        raw["surface"] = self.surface(stride_4)
         if self.task != "sections":
-            raw["surface"] = self.surface(stride_4)
             raw["height"], raw["slope"] = self.heights(stride_4, raw["surface"], geometry)
         return raw
 

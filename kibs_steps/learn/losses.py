@@ -59,8 +59,16 @@ def corner_losses(raw: Batch, batch: Batch) -> Batch:
     }
 
 
+def surface_losses(raw: Batch, batch: Batch) -> Batch:
+    """Loss term of the kinds of surface, which both sections and heights follow from."""
+    share = batch["surface"]
+    known = share.sum(1) > 0
+    surface = -(share * F.log_softmax(raw["surface"], dim=1)).sum(1)
+    return {"surface": surface.sum() / known.sum().clamp(min=1)}
+
+
 def height_losses(raw: Batch, batch: Batch) -> Batch:
-    """Loss terms of what heights follow from: kinds of surface, heights (their distribution and its mean), slopes."""
+    """Loss terms of heights (their distribution and its mean) and slopes."""
     log_height = F.log_softmax(raw["height"], dim=1)
     centres = torch.from_numpy(CENTRES).float().to(log_height.device)
 
@@ -71,19 +79,22 @@ def height_losses(raw: Batch, batch: Batch) -> Batch:
         off = F.smooth_l1_loss(chosen.exp() @ centres, height[cells], reduction="sum", beta=1.0)
         return (0.2 * off - (torch.from_numpy(soft).to(chosen.device) * chosen).sum()) / max(len(cells[0]), 1)
 
-    share = batch["surface"]
-    known = share.sum(1) > 0
-    surface = -(share * F.log_softmax(raw["surface"], dim=1)).sum(1)
     sloped = torch.isfinite(batch["slope"])
     slope_error = (raw["slope"] - torch.nan_to_num(batch["slope"]).clamp(-1.5, 1.5)).abs() * sloped
     return {
-        "surface": surface.sum() / known.sum().clamp(min=1),
         "height": 0.4 * height_loss(batch["corner_height"]),
         "roof_height": 0.6 * height_loss(batch["roof_height"]),
         "slope": 3 * slope_error.sum() / sloped.sum().clamp(min=1),
     }
 
 
-def losses(raw: Batch, batch: Batch) -> Batch:
-    """All loss terms."""
-    return {**section_losses(raw, batch), **corner_losses(raw, batch), **height_losses(raw, batch)}
+TERMS = {
+    "sections": (section_losses, surface_losses),
+    "corners": (corner_losses, surface_losses, height_losses),
+    "both": (section_losses, corner_losses, surface_losses, height_losses),
+}
+
+
+def losses(raw: Batch, batch: Batch, task: str) -> Batch:
+    """All loss terms of a task."""
+    return {name: value for terms in TERMS[task] for name, value in terms(raw, batch).items()}

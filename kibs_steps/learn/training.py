@@ -36,7 +36,7 @@ from kibs_steps.models.contract import ContractMismatch
 
 DISTANCE_CLIP = 5.0  # px
 BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
-BLENDED = 0.4  # share of tiles that are shown blended
+BLENDED = {"sections": 0.0, "both": 0.4, "corners": 1.0}  # share of tiles that are shown blended
 
 
 class Settings(NamedTuple):
@@ -81,35 +81,44 @@ class Onwards(torch.utils.data.Sampler):
         return iter(range(self.start, 2**31))
 
 
-def example(sample: dataset.Sample, rng: np.random.Generator, blended: bool) -> dict[str, np.ndarray]:
-    """Image, plain or blended with sections as a model might find them, geometry and all targets.
+def example(
+    sample: dataset.Sample, rng: np.random.Generator, blended: bool, task: str = "both"
+) -> dict[str, np.ndarray]:
+    """Image, plain or blended with sections as a model might find them, geometry and the targets of a task.
 
     A blended image shows the sections: what it is asked for is corners and heights.
     """
     size = sample.labels.shape
-    plain = np.float32(not blended)
-    return {
+    found = {
         "image": (painted(sample, rng) if blended else sample.rgb).transpose(2, 0, 1).copy(),
         "geometry": sample.geometry,
-        "roof": np.where(blended, np.uint8(targets.IGNORED), sample.roof),
-        "edge": targets.edge(sample.labels),
-        "distance": targets.distance(sample.labels, DISTANCE_CLIP),
-        "sections_known": plain * (sample.labels >= 0).astype(np.float32) * targets.section_weight(sample.labels),
-        "heat": targets.corner_heat(sample.corners, size),
-        "offset": targets.corner_offset(sample.corners, size),
-        "corners_known": sample.corners_known,
         "surface": targets.surface(sample.surface, SURFACES),
-        "slope": targets.slope(sample.labels, sample.height),
-        "corner_height": targets.corner_height(sample.corners, sample.corner_heights, size),
-        "roof_height": targets.roof_height(sample.height),
     }
+    if task != "corners":
+        plain = np.float32(not blended)
+        found |= {
+            "roof": np.where(blended, np.uint8(targets.IGNORED), sample.roof),
+            "edge": targets.edge(sample.labels),
+            "distance": targets.distance(sample.labels, DISTANCE_CLIP),
+            "sections_known": plain * (sample.labels >= 0).astype(np.float32) * targets.section_weight(sample.labels),
+        }
+    if task != "sections":
+        found |= {
+            "heat": targets.corner_heat(sample.corners, size),
+            "offset": targets.corner_offset(sample.corners, size),
+            "corners_known": sample.corners_known,
+            "slope": targets.slope(sample.labels, sample.height),
+            "corner_height": targets.corner_height(sample.corners, sample.corner_heights, size),
+            "roof_height": targets.roof_height(sample.height),
+        }
+    return found
 
 
 def example_of(sample: dataset.Sample, rng: np.random.Generator, settings: Settings) -> dict[str, np.ndarray]:
     """The example of a sample that a run's family and task learn from."""
     if settings.family == "maskrcnn":
         return maskrcnn.example(sample, settings.task, supposed(sample, rng))
-    return example(sample, rng, bool(rng.random() < BLENDED))
+    return example(sample, rng, bool(rng.random() < BLENDED[settings.task]), settings.task)
 
 
 def painted(sample: dataset.Sample, rng: np.random.Generator) -> np.ndarray:
@@ -136,7 +145,7 @@ def dense_terms(model: Dense, batch: Batch) -> Batch:
     image = normalised(batch["image"]).contiguous(memory_format=torch.channels_last)
     with torch.autocast(device, torch.bfloat16, enabled=quick):
         raw = model.logits(image, batch["geometry"])
-    return losses({k: v.float() for k, v in raw.items()}, batch)
+    return losses({k: v.float() for k, v in raw.items()}, batch, model.task)
 
 
 def network(task: str = "both", family: str = "dense") -> nn.Module:
@@ -307,7 +316,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.training", description=main.__doc__)
     parser.add_argument("--out", required=True, help="folder of this run")
     parser.add_argument("--family", choices=["dense", "maskrcnn"], default="dense")
-    parser.add_argument("--task", choices=["both", "sections", "corners"], help="maskrcnn: which of the two networks")
+    parser.add_argument("--task", choices=["both", "sections", "corners"], help="what to learn (maskrcnn: not both)")
     parser.add_argument("--minutes", type=float, default=30, help="budget, all calls together")
     parser.add_argument("--steps", type=int, help="end after so many steps in all")
     parser.add_argument("--seed", type=int, default=0)
@@ -329,13 +338,14 @@ def main(argv: list[str] | None = None) -> None:
         task = args.task or "sections"
         settings = Settings(args.seed, maskrcnn.TILE, args.batch or 2, args.rate or 2e-4, family="maskrcnn", task=task)
     else:
-        settings = Settings(args.seed, batch=args.batch or 8, rate=args.rate or 2e-3)
+        settings = Settings(args.seed, batch=args.batch or 8, rate=args.rate or 2e-3, task=args.task or "both")
     model = network(settings.task, settings.family)
     if args.init:
         start_from(model, args.init)
     elif args.family == "dense":
         model.encoder.load_imagenet()
-    found = sources.gather(args, settings.size, args.family == "dense", settings.task == "corners")
+    dense = args.family == "dense"
+    found = sources.gather(args, settings.size, dense, settings.task == "corners" and not dense)
     kept = [
         example_of(sample, np.random.default_rng([args.seed, i, 2]), settings)
         for i, sample in enumerate(found.validation)

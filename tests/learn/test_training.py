@@ -74,7 +74,9 @@ def test_unknown_ground_gives_no_gradient():
     sample = sample._replace(corners=sample.corners[::3], corner_heights=sample.corner_heights[::3])
     sample.surface[:, :32] = 0
     raw = logits()
-    sum(training.losses(raw, batch_of(training.example(sample, np.random.default_rng(0), False))).values()).backward()
+    sum(
+        training.losses(raw, batch_of(training.example(sample, np.random.default_rng(0), False)), "both").values()
+    ).backward()
     for name, value in raw.items():
         half = value.shape[-1] // 2
         assert not value.grad[..., half:].any(), name
@@ -84,7 +86,9 @@ def test_unknown_ground_gives_no_gradient():
 def test_blended_tiles_teach_corners_and_heights_only():
     raw = logits()
     sum(
-        training.losses(raw, batch_of(training.example(Tiles().sample, np.random.default_rng(0), True))).values()
+        training.losses(
+            raw, batch_of(training.example(Tiles().sample, np.random.default_rng(0), True)), "both"
+        ).values()
     ).backward()
     for name in ("roof", "edge", "distance"):
         assert not raw[name].grad.any(), name
