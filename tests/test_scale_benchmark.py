@@ -19,6 +19,15 @@ def test_flood_fill_finds_the_areas_that_labelling_finds():
     assert rivals.flooded(roofs) == ndimage.label(roofs)[1]
 
 
+def test_sections_are_flooded_one_by_one_though_they_touch():
+    """A quilt of 6 × 6 px sections, without a gap: 16 areas once they are a pixel apart, none smaller than 5 × 5."""
+    quilt = np.kron(np.arange(1, 17).reshape(4, 4), np.ones((6, 6), int))
+    roofs = rivals.apart(quilt)
+    assert rivals.flooded(roofs) == 16
+    assert np.bincount(quilt[roofs])[1:].min() == 25
+    assert not rivals.apart(np.zeros((4, 4), int)).any()
+
+
 def test_a_power_law_is_found():
     sizes = [0.1, 0.4, 1.6]
     assert rivals.law(sizes, [3 * s**1.9 for s in sizes]) == pytest.approx((1.9, 3.0))

@@ -14,6 +14,7 @@ from kibs_steps.plan import BadConfig
 DEFAULTS = {
     "name": "mine",
     "family": "dense",
+    "networks": "shared",
     "data": None,
     "own": [],
     "split": "blocks",
@@ -33,10 +34,9 @@ DEFAULTS = {
 ANGLES = tuple(f"{name}_{angle}" for name in ("view", "sun") for angle in ("azimuth", "elevation"))
 OWN = ("raster", "dtm", "truth", "buildings", "annotated", "truth_frame", "truth_z", *ANGLES)
 OWN += ("projection_height", "bands", "aoi")
-EXPORTS = {  # network that is trained -> models made of it
-    "dense": {"both": ("both", "sections", "corners")},
-    "maskrcnn": {"sections": ("sections",), "corners": ("corners",)},
-}
+# network that is trained -> models made of it
+SHARED = {"both": ("both", "sections", "corners")}
+SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
 
 
 class Recipe(NamedTuple):
@@ -92,7 +92,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
         if scene.get("view_azimuth") is None or scene.get("view_elevation") is None:
             raise BadConfig(f"train.scene: {train['scene']} has no view_azimuth and view_elevation to simulate for")
         options += [f"--{k.replace('_', '-')}={scene[k]}" for k in ANGLES if scene.get(k) is not None]
-    exports = EXPORTS[train["family"]]
+    exports = SHARED if (train["family"], train["networks"]) == ("dense", "shared") else SEPARATE
     training = {}
     for network in exports:
         init = [f"--init={weights(train['init'], network, base)}"] if train["init"] else []

@@ -17,8 +17,9 @@ def test_defaults_train_the_dense_network_once_for_three_models(tmp_path):
     assert not [o for o in found.training["both"] if o.startswith(("--view", "--init", "--data"))]
 
 
-def test_the_papers_pair_is_two_networks(tmp_path):
-    found = recipe.recipe({"train": {"family": "maskrcnn", "name": "paper"}}, tmp_path)
+@pytest.mark.parametrize("settings", [{"family": "maskrcnn"}, {"networks": "separate"}])
+def test_the_papers_pair_is_two_networks_and_ours_may_be(tmp_path, settings):
+    found = recipe.recipe({"train": {"name": "paper", **settings}}, tmp_path)
     assert found.network_of == {"sections": "sections", "corners": "corners"}
     assert "--task=corners" in found.training["corners"]
 
