@@ -15,19 +15,9 @@ import numpy as np
 
 from kibs_steps import cli, raster, scene, sections, store
 from kibs_steps.grid import Tiling
+from kibs_steps.labels import rims
 
 Bands = list[int | None]
-
-
-def rims(labels: np.ndarray) -> np.ndarray:
-    """Section pixels (s, s) that have a 4-neighbour of another label."""
-    rim = np.zeros(labels.shape, bool)
-    vertical, horizontal = labels[1:] != labels[:-1], labels[:, 1:] != labels[:, :-1]
-    rim[1:] |= vertical
-    rim[:-1] |= vertical
-    rim[:, 1:] |= horizontal
-    rim[:, :-1] |= horizontal
-    return rim & (labels > 0)
 
 
 def blend(rgb: np.ndarray, labels: np.ndarray, inside: Bands, rim: Bands, outside: Bands) -> np.ndarray:

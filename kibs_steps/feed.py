@@ -16,6 +16,7 @@ import shapely
 from kibs_steps import cli, scene, store
 from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Block, Grid, Tiling
+from kibs_steps.models import scoring
 from kibs_steps.sections import PIECES, SIDES
 from kibs_steps.stitch import owner_blocks, section_ids
 
@@ -49,6 +50,7 @@ def feed(truth: pa.Table, block: Block, grid: Grid, tiling: Tiling) -> tuple[pa.
             shapely.to_wkb(shapely.force_2d(seen)),
             truth["split"].to_numpy(),
             owner,
+            pa.array(list(scoring.none(n)), PIECES.field("evidence").type),
         ],
         schema=PIECES,
     )

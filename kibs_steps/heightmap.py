@@ -53,10 +53,10 @@ def table(labels: NDArray[np.int64], sums: NDArray[np.float64]) -> pa.Table:
     return pa.table([labels, pa.FixedSizeListArray.from_arrays(flat, len(SUMS))], schema=HEIGHTS)
 
 
-def column(sums: pa.ChunkedArray) -> NDArray[np.float64]:
-    """A column of sums as an array (n, 10)."""
-    parts = [part.flatten().to_numpy(zero_copy_only=False) for part in sums.chunks]
-    return np.concatenate([*parts, np.zeros(0)]).reshape(-1, len(SUMS))
+def column(lists: pa.ChunkedArray, width: int = len(SUMS)) -> NDArray[np.float64]:
+    """A column of lists of one length, such as sums, as an array (n, width)."""
+    parts = [part.flatten().to_numpy(zero_copy_only=False) for part in lists.chunks]
+    return np.concatenate([*parts, np.zeros(0)]).reshape(-1, width)
 
 
 def points(sums: NDArray[np.float64]) -> NDArray[np.float64]:

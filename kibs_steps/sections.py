@@ -19,9 +19,11 @@ import pyarrow as pa
 
 from kibs_steps import cli, raster, scene, store
 from kibs_steps.grid import Block, Grid, Tile, Tiling, Window
+from kibs_steps.labels import rims
+from kibs_steps.models import scoring
 
 if TYPE_CHECKING:
-    from kibs_steps.models import heads, runtime
+    from kibs_steps.models import runtime
 
 MIN_STRIP_IOU = 0.3  # two views of one section share most of the strip; a neighbour's rim shares a pixel line
 SIDES = ("north", "south", "west", "east")
@@ -33,11 +35,17 @@ BURNT = 0.5  # share of a tile's data
 
 
 class View(NamedTuple):
-    """What one tile sees: labels (s, s) int32 over its full window, zero outside the data, and a score per label."""
+    """What one tile sees: labels (s, s) int32 over its full window, zero outside the data, and a score per label.
+
+    `evidence` (n, 6) is what its core shows of each label (`scoring.evidence`), zero from models that do not tell. Labels begin
+    at `used` + 1; some may lie wholly outside the data.
+    """
 
     tile: Tile
     labels: np.ndarray
     scores: np.ndarray
+    evidence: np.ndarray
+    used: int
 
 
 def core_of(view: np.ndarray, tile: Tile, margin: int) -> np.ndarray:
@@ -100,12 +108,20 @@ def tile_images(
         yield tile, tile_image(rgb, tile, tiling, core, grid), data
 
 
-def view_of(tile: Tile, found: heads.Sections | None, data: np.ndarray, used: int) -> View:
-    """What a tile's detections (None: not looked at) become where there is data, with labels from `used` + 1 on."""
-    if found is None:
-        return View(tile, np.zeros(data.shape, np.int32), np.zeros(0, np.float32))
-    labels = np.where(data, found.labels, 0)
-    return View(tile, np.where(labels > 0, labels + used, 0).astype(np.int32), found.scores)
+def view_of(
+    tile: Tile, outputs: dict[str, np.ndarray] | None, contract: dict, margin: int, data: np.ndarray, used: int
+) -> View:
+    """What a network's outputs for a tile (None: not looked at) mean where there is data, with labels from `used` + 1 on."""
+    from kibs_steps.models import heads
+
+    if outputs is None:
+        return View(tile, np.zeros(data.shape, np.int32), np.zeros(0, np.float32), scoring.none(0), used)
+    found = heads.decode_sections(outputs, contract)
+    labels, shown = np.where(data, found.labels, 0), scoring.none(len(found.scores))
+    if contract["head"] == "dense":
+        maps = (labels, rims(labels), outputs["roof"][0], outputs["edge"][0], outputs["distance"][0])
+        shown = scoring.evidence(*(core_of(m, tile, margin) for m in maps), n=len(found.scores))
+    return View(tile, np.where(labels > 0, labels + used, 0).astype(np.int32), found.scores, shown, used)
 
 
 def detect(
@@ -121,13 +137,10 @@ def detect(
 
     Tiles without data are not run. Labels are numbered through the block, tile after tile.
     """
-    from kibs_steps.models import heads
-
     views, used = [], 0
     for tile, image, data in tile_images(rgb, valid, tiling, block, grid):
         seen = core_of(data, tile, tiling.margin).any()
-        found = heads.decode_sections(network(image), contract) if seen else None
-        views.append(view_of(tile, found, data, used))
+        views.append(view_of(tile, network(image) if seen else None, contract, tiling.margin, data, used))
         used += len(views[-1].scores)
     return views
 
@@ -197,6 +210,7 @@ PIECES = pa.schema(
         ("outline", pa.binary()),
         ("split", pa.int64()),
         ("owner", pa.int64()),
+        ("evidence", pa.list_(pa.float64(), len(scoring.EVIDENCE))),
     ]
 )
 
@@ -205,7 +219,7 @@ def pieces(views: list[View], clear: np.ndarray, tiling: Tiling, core: Window) -
     """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it is void, which is in or
     beside pixels that are not `clear` (no data, burnt out).
 
-    `split` and `owner` are for truth that is fed instead of detections: 2 (none) and 0 here.
+    `split` and `owner` are for truth that is fed instead of detections: 2 (none) and 0 here. `evidence` as in `View`.
     """
     rows = []
     p = tiling.margin
@@ -217,21 +231,21 @@ def pieces(views: list[View], clear: np.ndarray, tiling: Tiling, core: Window) -
         place = window_in_block(view.tile.core, core, p)
         blank = ~clear[place.row : place.row + place.height, place.col : place.col + place.width]
         near_blank = set(np.unique(inside[grown(blank)]).tolist()) if blank.any() else set()
-        first = int(view.labels[view.labels > 0].min(initial=np.iinfo(np.int32).max))
         for label in np.unique(view.labels[view.labels > 0]).tolist():
-            outline = outlines.get(label)
+            outline, number = outlines.get(label), label - view.used - 1
             rows.append(
                 {
                     "label": label,
                     "tile_row": view.tile.row,
                     "tile_col": view.tile.col,
-                    "score": float(view.scores[label - first]) if label - first < len(view.scores) else 0.0,
+                    "score": float(view.scores[number]),
                     "core_area": int(own[label]),
                     "full_area": int(full[label]),
                     "void": label in near_blank,
                     "outline": outline,
                     "split": 2,
                     "owner": 0,
+                    "evidence": view.evidence[number].tolist(),
                 }
             )
     return pa.Table.from_pylist(rows, schema=PIECES)

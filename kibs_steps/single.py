@@ -31,12 +31,11 @@ def detect(
     """What every tile of a block image (core grown by the margin; rgb uint8, valid bool) sees, all its corners and heights."""
     views, used, tables, heights = [], 0, [corners.CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile, image, data in sections.tile_images(rgb, valid, tiling, block, grid):
-        found = outputs = None
+        outputs = None
         if sections.core_of(data, tile, tiling.margin).any():
             outputs = network(image)
-            found = heads.decode_sections(outputs, contract)
             tables.append(corners.of_tile(heads.decode_corners(outputs, contract), tile, tiling))
-        views.append(sections.view_of(tile, found, data, used))
+        views.append(sections.view_of(tile, outputs, contract, tiling.margin, data, used))
         if outputs is not None:
             shown = heads.height_map(outputs, contract)
             heights.append(corners.heights_of_tile(shown, views[-1].labels, tile, tiling))

@@ -26,13 +26,14 @@ import shapely
 from kibs_steps import cli, heightmap, scene, store
 from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Block, Grid, Tiling
+from kibs_steps.models import scoring
 from kibs_steps.sections import SEAM_RULES, links_across
 
 CUT = 2.0  # px: smoothing moves an outline no further
 SAME_CORNER = 3.0  # px: two tiles' views of one corner lie closer than two corners of a roof
 NEAR = 4.0  # px: sections closer than this are smoothed together; smoothing moves no outline as far
 NUMBERS = ["label", "tile_row", "tile_col", "core_area", "full_area"]
-FACTS = ["label", "outline", "score", "void", "split", "owner"]
+FACTS = ["label", "outline", "score", "void", "split", "owner", "evidence"]
 
 SECTIONS = pa.schema(
     [
@@ -78,7 +79,7 @@ class Joined(NamedTuple):
 
 class Parts(NamedTuple):
     """Columns of outlines (px) on their way: piece number (or 0), group, geometry, score, void, split, owner,
-    sums of heights (n, 10)."""
+    evidence (n, 6), sums of heights (n, 10)."""
 
     number: np.ndarray
     group: np.ndarray
@@ -87,6 +88,7 @@ class Parts(NamedTuple):
     void: np.ndarray
     split: np.ndarray
     owner: np.ndarray
+    evidence: np.ndarray
     sums: np.ndarray
 
     def take(self, rows: np.ndarray) -> Parts:
@@ -101,6 +103,7 @@ class Parts(NamedTuple):
 
 NOTHING = Parts(
     *(np.zeros(0, kind) for kind in (np.int64, np.int64, object, float, bool, np.int64, np.int64)),
+    scoring.none(0),
     np.zeros((0, len(heightmap.SUMS))),
 )
 
@@ -161,10 +164,11 @@ def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
     return Joined(number, groups(len(order), link), stands, row)
 
 
-def united(pieces: Parts) -> Parts:
+def united(pieces: Parts, weights: dict[str, float] | None = None) -> Parts:
     """Sections from pieces in order of number: the union of every group, then one section per connected part.
 
-    Scores are means weighted by area. Every part of a group has the sums of heights of the whole.
+    Scores are those of the pieces' evidence together, by the `weights` of the model; without evidence means weighted by area.
+    Every part of a group has the score and the sums of heights of the whole.
     """
     order = np.argsort(pieces.group, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(pieces.group[order]) != 0]) if len(order) else np.zeros(0, int)
@@ -174,14 +178,23 @@ def united(pieces: Parts) -> Parts:
         some = pieces.take(members)
         whole = some.geometry[0] if len(members) == 1 else shapely.union_all(some.geometry)
         score = float((area[members] / area[members].sum() * some.score).sum())
-        facts = score, bool(some.void.any()), int(some.split.max()), int(some.owner.max()), some.sums.sum(axis=0)
+        evidence = scoring.together(some.evidence)
+        facts = (
+            score,
+            bool(some.void.any()),
+            int(some.split.max()),
+            int(some.owner.max()),
+            evidence,
+            some.sums.sum(axis=0),
+        )
         rows += [(part, *facts) for part in shapely.get_parts(whole)]
     if not rows:
         return NOTHING
-    geometry, score, void, split, owner, sums = zip(*rows, strict=True)
+    geometry, score, void, split, owner, evidence, sums = map(np.array, zip(*rows, strict=True))
+    told = evidence[:, 0] > 0
+    score = np.where(told, scoring.scores(evidence, weights), score)
     none = np.zeros(len(rows), np.int64)
-    shapes = shapely.normalize(np.array(geometry, object))
-    return Parts(none, none, shapes, *map(np.array, (score, void, split, owner, sums)))
+    return Parts(none, none, shapely.normalize(geometry), score, void, split, owner, evidence, sums)
 
 
 def of_pieces(labels: np.ndarray, heights: pa.Table) -> np.ndarray:
@@ -300,7 +313,13 @@ def finished(sections: Parts, grid: Grid, tolerance: float) -> pa.Table:
 
 
 def sweep(
-    blocks: list[Block], found: Detections, grid: Grid, tiling: Tiling, tolerance: float, rule: str
+    blocks: list[Block],
+    found: Detections,
+    grid: Grid,
+    tiling: Tiling,
+    tolerance: float,
+    rule: str,
+    weights: dict[str, float] | None,
 ) -> Iterator[tuple[int, pa.Table]]:
     """The sections of each row of blocks (table after `SECTIONS`, by id), row after row."""
     whole = joined(blocks, found, rule)
@@ -316,7 +335,8 @@ def sweep(
             if block.row == row:
                 table, number = found.pieces(block, FACTS), whole.number[block.name]
                 shapes = shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False))
-                rest = [table[name].to_numpy(zero_copy_only=False) for name in FACTS[2:]]
+                rest = [table[name].to_numpy(zero_copy_only=False) for name in FACTS[2:-1]]
+                rest.append(heightmap.column(table["evidence"], len(scoring.EVIDENCE)))
                 sums = of_pieces(table["label"].to_numpy(), found.heights(block))
                 pieces.append(Parts(number, whole.group[number], shapes, *rest, sums).take(whole.stands[number]))
         every = Parts.joined(pieces)
@@ -328,7 +348,7 @@ def sweep(
 
             split = scan_order.first_come(complete.geometry, complete.group, complete.split)
             complete = complete._replace(split=split)
-        open_ = Parts.joined([open_, united(complete)])
+        open_ = Parts.joined([open_, united(complete, weights)])
         limit = (row + 1) * side
         leaves = np.ones(len(open_.group), bool)
         if tolerance > 0 and row != rows[-1]:
@@ -359,14 +379,16 @@ def stitch(
     tolerance: float,
     reach: float,
     rule: str = "overlap",
+    weights: dict[str, float] | None = None,
 ) -> Iterator[tuple[Block, pa.Table, pa.Table]]:
     """Every block, row by row, with its sections and corners (tables after `SECTIONS` and `corners.CORNERS`).
 
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
     corners may lie; `rule` as in `sections.links_across`: by `touch` the first piece in scan order also gives the split.
+    `weights` are the model's for scores (`models.scoring`).
     """
     corners = distinct_corners(pa.concat_tables([CORNERS.empty_table(), *(found.corners(b) for b in blocks)]))
-    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule):
+    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule, weights):
         of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 1]
         for block in sorted((b for b in blocks if b.row == row), key=lambda b: b.col):
             mine = table.filter(pa.array(of == block.col))
@@ -408,6 +430,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
+    parser.add_argument("--model", help="models/sections.json, for scores")
     parser.add_argument("--without-corners", action="store_true", help="no corners were looked for")
     parser.add_argument("--with-heights", action="store_true", help="a model gave heights all over the sections")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
@@ -431,8 +454,10 @@ def main(argv: list[str] | None = None) -> None:
     )
     blocks = [tiling.block_of(name) for name in folders]
     missing = missing_areas(blocks, facts.grid, tiling)
+    weights = store.read_json(args.model)["contract"].get("score") if args.model else None
     with store.by_block(args.sections, SECTIONS) as sections, store.by_block(args.corners, CORNERS) as corners:
-        for block, mine, near in stitch(blocks, found, facts.grid, tiling, args.tolerance, args.reach, args.seam_rule):
+        settings = (args.tolerance, args.reach, args.seam_rule, weights)
+        for block, mine, near in stitch(blocks, found, facts.grid, tiling, *settings):
             sections(block.name, cut_by(mine, missing))
             corners(block.name, near)
 

@@ -9,7 +9,7 @@ from skimage.segmentation import flood_fill
 
 from kibs_steps import scan_order, sections, stitch
 from kibs_steps.grid import Tile, Tiling, Window
-from kibs_steps.models import heads
+from kibs_steps.models import scoring
 
 TILING = Tiling(24, 2, 2)
 CORE = TILING.stride
@@ -51,7 +51,8 @@ def test_touching_pieces_are_what_a_flood_fill_joins(side, splits, seed):
         jitter = rng.integers(0, 3, 2)
         part = world[window.row + 2 + jitter[0] :, window.col + 2 + jitter[1] :][:24, :24]
         labels, n = connected(part)
-        views.append(sections.view_of(tile, heads.Sections(labels, np.ones(n)), np.ones((24, 24), bool), used))
+        shown = np.where(labels > 0, labels + used, 0).astype(np.int32)
+        views.append(sections.View(tile, shown, np.ones(n), scoring.none(n), used))
         used += n
     links = sections.inner_links(views, TILING.margin, "touch")
     pieces = {}

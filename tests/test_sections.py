@@ -6,6 +6,7 @@ import shapely
 
 from kibs_steps import sections
 from kibs_steps.grid import Grid, Tiling
+from kibs_steps.models import scoring
 
 SIDE, MARGIN = 64, 8
 TILING = Tiling(SIDE, MARGIN, 2)
@@ -21,7 +22,7 @@ def block(share: float, white: int = 255):
     for number, tile in enumerate(TILING.tiles(place, 96, 96)):
         labels = np.zeros((SIDE, SIDE), np.int32)
         labels[20:30, 20:30] = number + 1
-        views.append(sections.View(tile, labels, np.array([0.9])))
+        views.append(sections.View(tile, labels, np.array([0.9]), scoring.none(1), number))
     return rgb, np.ones(rgb.shape[:2], bool), views, core
 
 

@@ -3,7 +3,7 @@
 A mean roof probability says little about a section: small ones, and those whose rim has no edge, are wrong more often. The
 weights go into the contract (`score`), and a section's score is then the probability that it meets a true one at IoU ≥ 0.5.
 
-In: found sections with their traits (`models.heads.traits`), true labels. Out: weights by trait, and a bias.
+In: found sections with their traits (`models.scoring.traits`), true labels. Out: weights by trait, and a bias.
 """
 
 from __future__ import annotations

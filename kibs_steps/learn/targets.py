@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from kibs_steps.blend import rims
+from kibs_steps.labels import rims
 
 IGNORED = 255
 HEIGHT_STRIDE = 4

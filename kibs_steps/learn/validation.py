@@ -19,10 +19,11 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from kibs_steps import cli, store
-from kibs_steps.blend import blend, rims
+from kibs_steps.blend import blend
+from kibs_steps.labels import rims
 from kibs_steps.learn import calibration, dataset
 from kibs_steps.models import contract as contracts
-from kibs_steps.models import heads, runtime
+from kibs_steps.models import heads, runtime, scoring
 
 SMALLEST = 12  # px: smaller true sections are neither asked for nor held against a model
 
@@ -187,7 +188,7 @@ def best_thresholds(
             matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True)
         )
 
-    grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)]
+    grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)]
     roof, prominence = max(grid, key=lambda pair: score(*pair))
     return {"roof": roof, "prominence": prominence}
 
@@ -201,7 +202,8 @@ def score_weights(
         labels = heads.decode_sections(maps, contract).labels
         if labels.any():
             known = heads.mean_by_label(sample.labels >= 0, labels) > 0.5
-            found = heads.traits(labels, maps["roof"][0], maps["edge"][0], maps["distance"][0])
+            shown = (maps["roof"][0], maps["edge"][0], maps["distance"][0])
+            found = scoring.traits(scoring.evidence(labels, rims(labels), *shown))
             found_traits.append({name: value[known] for name, value in found.items()})
             hits.append(calibration.right(labels, sample.labels)[known])
     return calibration.weights(found_traits, hits)

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from kibs_steps.blend import rims
+from kibs_steps.labels import rims
+from kibs_steps.models import scoring
 
 PROMINENCE = 0.2  # of a section's summit, where the contract does not say
 SMOOTH = 0.5  # px: summits one pixel wide are noise
@@ -63,7 +64,7 @@ def dense_sections(
 
     `roof`, `edge`, `distance` are (s, s) in 0–1. Of all summits of distance − edge those count that rise `prominence` above
     the pass to a higher one. Every roof area is at least one section. Sections under `min_area` px are given to the neighbour
-    they touch most, or dropped when alone. `score` are the weights of `traits` that tell how likely a section is right;
+    they touch most, or dropped when alone. `score` are the weights of `scoring.traits` that tell how likely a section is right;
     without them its score is its mean roof probability.
     """
     mask = roof > thresholds["roof"]
@@ -75,31 +76,7 @@ def dense_sections(
     basins = flood(summits(level, mask), mask, level)
     labels = joined_basins(basins, level, thresholds.get("prominence", PROMINENCE))
     labels = absorb_small(labels, int(thresholds["min_area"]))
-    if score is None:
-        return Sections(labels, mean_by_label(roof, labels))
-    found = traits(labels, roof, edge, distance)
-    logit = sum((score[name] * value for name, value in found.items()), start=np.float64(score["bias"]))
-    return Sections(labels, (1 / (1 + np.exp(-logit))).astype(np.float32))
-
-
-def traits(labels: np.ndarray, roof: np.ndarray, edge: np.ndarray, distance: np.ndarray) -> dict[str, np.ndarray]:
-    """What tells good sections 1…n from bad ones, (n,) each: area (log px), mean roof probability, mean edge on the rim and
-    inside, height of the summit, and the rim's length against that of a square of the same area."""
-    rim = rims(labels)
-    n = int(labels.max(initial=0))
-    area = np.bincount(labels.ravel(), minlength=n + 1)[1:]
-    length = np.bincount(labels[rim], minlength=n + 1)[1:]
-    level = distance - edge
-    summit = np.full(n + 1, -np.inf, level.dtype)  # numpy is quick where no value changes its type
-    np.maximum.at(summit, labels.ravel(), level.ravel())
-    return {
-        "log_area": np.log(np.maximum(area, 1)),
-        "roof": mean_by_label(roof, labels),
-        "rim": mean_by_label(edge, np.where(rim, labels, 0), n),
-        "inside": mean_by_label(edge, np.where(rim, 0, labels), n),
-        "summit": summit[1:].astype(np.float64),
-        "rim_length": length**2 / (16.0 * np.maximum(area, 1)),
-    }
+    return Sections(labels, scoring.scores(scoring.evidence(labels, rims(labels), roof, edge, distance), score))
 
 
 def summits(level: np.ndarray, mask: np.ndarray) -> np.ndarray:

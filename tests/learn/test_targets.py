@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kibs_steps.blend import rims
+from kibs_steps.labels import rims
 from kibs_steps.learn import targets
 
 

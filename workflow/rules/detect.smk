@@ -229,6 +229,7 @@ rule stitch:
     input:
         scene=given("results/{scene}/scene.json"),
         detections=given(detections),
+        model=given(scored),
     output:
         sections="results/{scene}/stitched/sections.parquet",
         corners="results/{scene}/stitched/corners.parquet",
@@ -250,8 +251,9 @@ rule stitch:
         ],
         corners=lambda w: (["--without-corners"] if measured(plan(w)) else [])
         + (["--with-heights"] if mapped(plan(w)) else []),
+        model=lambda w: [f"--model={f}" for f in scored(w)],
     shell:
         "python -m kibs_steps.stitch --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --tolerance {params.tolerance}"
-        " --reach {params.reach} --seam-rule {params.seams} {params.corners}"
+        " --reach {params.reach} --seam-rule {params.seams} {params.corners} {params.model:q}"
         " --folders {params.folders:q} --sections {output.sections:q} --corners {output.corners:q} > {log:q} 2>&1"
