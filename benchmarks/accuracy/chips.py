@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from benchmarks.accuracy.methods import Method
-from kibs_steps import metrics
+from kibs_steps import metrics, photographs
 from kibs_steps.blend import blend
 from kibs_steps.learn import dataset, validation
 from kibs_steps.models import heads, runtime
@@ -39,8 +39,8 @@ def sets(data: Path, count: int, per_place: int) -> dict[str, list[dataset.Sampl
         "B photographs": validation.photographed(data, data / "roofgraph" / "roofgraph.tar", count, SIDE),
         "village": validation.village(data / "village", 256),
     }
-    places: dict[str, list[dataset.Chip]] = {}
-    for chip in dataset.read_chips(data / "chips"):
+    places: dict[str, list[photographs.Chip]] = {}
+    for chip in photographs.read_chips(data / "chips"):
         places.setdefault(chip.name.split("/")[0], []).append(chip)
     for place, chips in places.items():
         windows = [sample for chip in chips for sample in cut(chip)]
@@ -49,7 +49,7 @@ def sets(data: Path, count: int, per_place: int) -> dict[str, list[dataset.Sampl
     return {name: [middle(sample) for sample in samples] for name, samples in found.items()}
 
 
-def cut(chip: dataset.Chip) -> list[dataset.Sample]:
+def cut(chip: photographs.Chip) -> list[dataset.Sample]:
     """Windows of a chip at the models' GSD, side by side: roofs known, nothing else."""
     scale = chip.gsd / dataset.GSD
     size = tuple(max(SIDE, round(n * scale)) for n in chip.building.shape[::-1])

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import cv2
 import numpy as np
 
-from kibs_steps import cli, store
+from kibs_steps import cli, photographs, store
 from kibs_steps.errors import KibsError
 from kibs_steps.learn import dataset
 from kibs_steps.learn.dataset import Sample
@@ -243,7 +243,9 @@ def main(argv: list[str] | None = None) -> None:
         return
     files = sorted(Path(args.samples).glob("[!.]*.npz"))
     if not files:
-        raise dataset.NoTrainingData(f"{args.samples} holds no samples (*.npz): make some with kibs_steps.learn.own")
+        raise photographs.NoTrainingData(
+            f"{args.samples} holds no samples (*.npz): make some with kibs_steps.learn.own"
+        )
     named = ((path.stem, dataset.load(path)) for path in files)
     write(args.coco, named, paper_bins(args.highest), args.square)
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from kibs_steps import store
+from kibs_steps import photographs, store
 from kibs_steps.learn import dataset
 from kibs_steps.simulate import citymodel, draped
 
@@ -74,12 +74,12 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if args.data:
         data = Path(args.data)
         roof_graphs = args.roofgraph or data / "roofgraph" / "roofgraph.tar"
-        graphs = dataset.read_roof_graphs(roof_graphs)
-        chips = [c for c in dataset.read_chips(data / "chips") if c.name.split("/")[0] not in args.leave_out]
-    training = [graph for graph in graphs if not dataset.held_out(graph)]
+        graphs = photographs.read_roof_graphs(roof_graphs)
+        chips = [c for c in photographs.read_chips(data / "chips") if c.name.split("/")[0] not in args.leave_out]
+    training = [graph for graph in graphs if not photographs.held_out(graph)]
     own = [path for folder in args.own for path in sorted(Path(folder, "training").glob("[!.]*.npz"))]
     if args.own and not own:
-        raise dataset.NoTrainingData(
+        raise photographs.NoTrainingData(
             f"no training samples in {', '.join(args.own)}: make them with kibs_steps.learn.own"
         )
     view = _direction(args.view_azimuth, args.view_elevation)
@@ -166,7 +166,7 @@ def fill_pool(
     pool: Path,
     count: int,
     seed: int,
-    chips: list[dataset.Chip],
+    chips: list[photographs.Chip],
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
     cities: Sequence[citymodel.CityModel] = (),
@@ -190,5 +190,5 @@ def _wait_for_first(pool: Path, seconds: float = 600.0) -> None:
     end = time.monotonic() + seconds
     while not any(pool.glob("[!.]*.npz")):
         if time.monotonic() > end:
-            raise dataset.NoTrainingData(f"{pool} is still empty after {seconds:g} s: rendering does not work here")
+            raise photographs.NoTrainingData(f"{pool} is still empty after {seconds:g} s: rendering does not work here")
         time.sleep(0.2)

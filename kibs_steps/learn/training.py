@@ -1,7 +1,8 @@
 """Training a network within a time budget, resumed where a kill left it.
 
 Family `dense`: one network learns sections, corners and heights at once. Part of its tiles are blended with sections as a model
-might find them: so the same weights serve as 2D model on the image and as 3D model on the blended one (`learn.export`).
+might find them: so the same weights serve as 2D model on the image and as 3D model on the blended one (`learn.export`). Or it
+learns one task alone (`--task`), from plain tiles only or blended ones only.
 Family `maskrcnn`: the paper's network for one task (`learn.maskrcnn`).
 
 In: what `learn.sources` mixes: simulated tiles, a data folder (`roofgraph/`, `chips/`), a user's own samples. Out, below `--out`:

@@ -18,7 +18,7 @@ import rasterio
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from kibs_steps import cli, store
+from kibs_steps import cli, photographs, store
 from kibs_steps.blend import blend
 from kibs_steps.labels import rims
 from kibs_steps.learn import calibration, dataset
@@ -142,8 +142,8 @@ def simulated(count: int, size: int, view_elevation: tuple[float, float]) -> lis
 
 def photographed(data: Path, source: Path, count: int, size: int) -> list[dataset.Sample]:
     """Held-out roof photographs pasted into chips; unlike in training, the radiometry is left as it is."""
-    graphs = [graph for graph in dataset.read_roof_graphs(source) if dataset.held_out(graph)]
-    chips = dataset.read_chips(data / "chips")
+    graphs = [graph for graph in photographs.read_roof_graphs(source) if photographs.held_out(graph)]
+    chips = photographs.read_chips(data / "chips")
     samples = []
     for i in range(count):
         rng = np.random.default_rng([434343, i])

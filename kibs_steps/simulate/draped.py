@@ -4,7 +4,7 @@ The roof-graph data set (Ren et al. 2021) gives each vertex a nominal height at 
 above the eave without bending a face, so eave and pitch are free: each house gets its own. The photograph is taken from above,
 so it is draped by plan position alone. Its own shading is moderated by bringing the faces' mean brightness together.
 
-In: roof graphs (`learn.dataset.read_roof_graphs`) and the data set's `res_building/*.polyshape`. Out: `House`s; on a `Site`,
+In: roof graphs (`photographs.read_roof_graphs`) and the data set's `res_building/*.polyshape`. Out: `House`s; on a `Site`,
 faces.
 """
 
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kibs_steps.learn.dataset import GRAPH_GSD, REDUCED, NoTrainingData, RoofGraph
+from kibs_steps.photographs import GRAPH_GSD, REDUCED, NoTrainingData, RoofGraph
 from kibs_steps.simulate import roofs
 from kibs_steps.simulate.pieces import ROOF, WALL, Face, Photograph, Place, pick
 from kibs_steps.simulate.site import Site

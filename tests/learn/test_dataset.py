@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from kibs_steps import photographs
 from kibs_steps.learn import dataset
 
 
@@ -81,18 +82,18 @@ def roof_graphs(request, tmp_path):
 
 
 def test_roof_graphs_are_read_from_folder_and_tar(roof_graphs):
-    (graph,) = dataset.read_roof_graphs(roof_graphs)
-    assert graph.rgb.shape == (120 // dataset.REDUCED, 90 // dataset.REDUCED, 3)
+    (graph,) = photographs.read_roof_graphs(roof_graphs)
+    assert graph.rgb.shape == (120 // photographs.REDUCED, 90 // photographs.REDUCED, 3)
     assert graph.rgb[20, 15, 0] > 150  # red comes first
-    np.testing.assert_allclose(graph.vertices[2] * dataset.REDUCED, (60, 90))
+    np.testing.assert_allclose(graph.vertices[2] * photographs.REDUCED, (60, 90))
     assert [face.tolist() for face in graph.faces] == [[0, 1, 5, 4], [4, 5, 2, 3]]
 
 
 def test_missing_data_is_named(tmp_path):
-    with pytest.raises(dataset.NoTrainingData, match="roofgraph"):
-        dataset.read_roof_graphs(tmp_path / "roofgraph.tar")
-    with pytest.raises(dataset.NoTrainingData, match="chips"):
-        dataset.read_chips(tmp_path)
+    with pytest.raises(photographs.NoTrainingData, match="roofgraph"):
+        photographs.read_roof_graphs(tmp_path / "roofgraph.tar")
+    with pytest.raises(photographs.NoTrainingData, match="chips"):
+        photographs.read_chips(tmp_path)
 
 
 def test_pasted_houses_lie_under_their_labels(tmp_path):
@@ -100,7 +101,7 @@ def test_pasted_houses_lie_under_their_labels(tmp_path):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(content)
-    graphs = dataset.read_roof_graphs(tmp_path)
+    graphs = photographs.read_roof_graphs(tmp_path)
     ground = dataset.empty(np.full((128, 128, 3), 30, np.uint8))
     sample = dataset.pasted_houses(ground, graphs, np.random.default_rng(3))
     inside = cv2.erode((sample.labels > 0).astype(np.uint8), np.ones((3, 3))) > 0
@@ -116,7 +117,7 @@ def test_pasted_houses_lie_under_their_labels(tmp_path):
 def test_chip_samples_know_roofs_and_not_sections():
     building = np.zeros((200, 200), bool)
     building[40:160, 40:160] = True
-    chip = dataset.Chip("x", np.where(building[..., None], 200, 20).astype(np.uint8).repeat(3, 2), building, 0.3)
+    chip = photographs.Chip("x", np.where(building[..., None], 200, 20).astype(np.uint8).repeat(3, 2), building, 0.3)
     sample = dataset.chip_sample(chip, np.random.default_rng(0), 96)
     assert set(np.unique(sample.labels)) == {-1, 0}
     agree = (sample.rgb[..., 0] > 110) == (sample.roof == 1)
@@ -144,7 +145,7 @@ data = pytest.mark.skipif("KIBS_DATA" not in os.environ, reason="needs real data
 
 @data
 def test_real_chips_have_masks_of_their_size():
-    chips = dataset.read_chips(Path(os.environ["KIBS_DATA"]) / "chips")
+    chips = photographs.read_chips(Path(os.environ["KIBS_DATA"]) / "chips")
     assert len(chips) > 20
     for chip in chips:
         assert chip.rgb.shape == (*chip.building.shape, 3)

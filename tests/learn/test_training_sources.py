@@ -5,7 +5,7 @@ import argparse
 import numpy as np
 import pytest
 
-from kibs_steps import store
+from kibs_steps import photographs, store
 from kibs_steps.learn import dataset, sources
 
 
@@ -77,10 +77,10 @@ def test_photographs_make_a_model_non_commercial():
 
 
 def test_nothing_to_learn_from_is_said(tmp_path):
-    with pytest.raises(dataset.NoTrainingData, match="no training samples"):
+    with pytest.raises(photographs.NoTrainingData, match="no training samples"):
         sources.gather(arguments("--own", str(tmp_path), "--tiles=0"), 48)
     empty = sources.gather(arguments("--tiles=0", f"--out={tmp_path}/run/both"), 48)
-    with pytest.raises(dataset.NoTrainingData, match="nothing to learn from"):
+    with pytest.raises(photographs.NoTrainingData, match="nothing to learn from"):
         empty.mixture[0]
     with pytest.raises(argparse.ArgumentTypeError, match="no source"):
         sources.shares("simulatd=1")

@@ -8,7 +8,7 @@ import pytest
 
 from kibs_steps import terrain as dtm
 from kibs_steps.grid import Grid
-from kibs_steps.learn.dataset import GRAPH_GSD, REDUCED, NoTrainingData, RoofGraph, read_roof_graphs
+from kibs_steps.photographs import GRAPH_GSD, REDUCED, NoTrainingData, RoofGraph, read_roof_graphs
 from kibs_steps.simulate import draped, scene
 from kibs_steps.simulate.camera import Camera
 from kibs_steps.simulate.pieces import ROOF, City, Paint, Place
