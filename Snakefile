@@ -37,6 +37,11 @@ onstart:
     for p in PLANS.values():
         for warning in p.warnings:
             logger.warning(f"{p.name}: {warning}")
+    # Snakemake's default limit of 100 jobs a second makes it look at all ready jobs again a second after every look, and each look
+    # starts another: after some hundred jobs that takes a core. Nothing here needs a limit; one that is asked for is kept.
+    limit = workflow.scheduler.job_rate_limiter
+    if limit and (limit.max_jobs, limit.timespan) == (100, 1):
+        workflow.scheduler.job_rate_limiter = None
 
 
 onsuccess:

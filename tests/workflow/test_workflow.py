@@ -128,6 +128,15 @@ def test_nothing_to_do_is_quick_and_touching_is_nothing(copy):
     print(f"a run with nothing to do took {time.monotonic() - start:.1f} s")
 
 
+def test_snakemake_looks_at_ready_jobs_once_per_job(tmp_path):
+    """Not every second besides, in ever more chains, as its default limit of jobs per second would have it."""
+    world(tmp_path)
+    output = run(tmp_path, "--verbose", cores=1, only=["labels.tif"])
+    looks, done = output.count("Ready jobs: "), output.count("Finished jobid: ")
+    assert done > 5
+    assert looks <= done + 1
+
+
 def test_another_corner_model_reruns_corners_only(copy):
     before = digests(copy)
     toy.corners_model(copy / "models/corners.onnx", bias=1.0)
