@@ -118,5 +118,6 @@ def weights(init: str, network: str, base: Path) -> Path:
     named = [folder / f"{network}.pt", folder / "weights.pt"]
     found = [f for f in named if f.is_file()] or sorted(folder.glob("*.pt"))
     if not found or (len(found) > 1 and found[0] not in named):
-        raise BadConfig(f"train.init: {init} is no file, and {folder} holds no {network}.pt or weights.pt")
+        apart = "" if network != "both" else " (a set with sections.pt and corners.pt needs networks: separate)"
+        raise BadConfig(f"train.init: {init} is no file, and {folder} holds no {network}.pt or weights.pt{apart}")
     return found[0]
