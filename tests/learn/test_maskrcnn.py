@@ -158,12 +158,12 @@ def test_training_lowers_the_loss_and_goes_on_after_a_kill(task, tmp_path):
     settings = training.Settings(0, size=SIZE, batch=1, rate=2e-3, family="maskrcnn", task=task)
     budget = 1e7  # s: the rate follows the share used, and a slow machine must not change it
     assert training.train(model, Same(), settings, tmp_path, budget, steps=2, workers=0) == 2
-    assert training.train(small(task, 5), Same(), settings, tmp_path, budget, steps=4, workers=0) == 4
+    assert training.train(small(task, 5), Same(), settings, tmp_path, budget, steps=10, workers=0) == 10
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     model.load_state_dict(state["model"])
     assert loss(model) < before
     with pytest.raises(contracts.ContractMismatch, match="another run"):
-        training.train(model, Same(), settings._replace(task="both"), tmp_path, budget, steps=7, workers=0)
+        training.train(model, Same(), settings._replace(task="both"), tmp_path, budget, steps=11, workers=0)
 
 
 def test_blend_is_the_contracts():
