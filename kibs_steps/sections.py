@@ -97,15 +97,7 @@ def tile_images(
     """Every tile of a block image (core grown by the margin; rgb uint8, valid bool): tile, image (s, s, 3), data mask (s, s)."""
     core = tiling.block_core(block, grid.width, grid.height)
     for tile in tiling.tiles(block, grid.width, grid.height):
-        data = np.zeros((tiling.tile, tiling.tile), bool)
-        window = tiling.window(tile)
-        inside = window.within(grid)
-        place = window_in_block(inside, core, tiling.margin)
-        top, left = inside.row - window.row, inside.col - window.col
-        data[top : top + inside.height, left : left + inside.width] = valid[
-            place.row : place.row + place.height, place.col : place.col + place.width
-        ]
-        yield tile, tile_image(rgb, tile, tiling, core, grid), data
+        yield tile, tile_image(rgb, tile, tiling, core, grid), tile_image(valid, tile, tiling, core, grid, "constant")
 
 
 def view_of(
@@ -150,22 +142,21 @@ def window_in_block(window: Window, core: Window, margin: int) -> Window:
     return Window(window.col - core.col + margin, window.row - core.row + margin, window.width, window.height)
 
 
-def tile_image(image: np.ndarray, tile: Tile, tiling: Tiling, core: Window, grid: Grid) -> np.ndarray:
+def tile_image(
+    image: np.ndarray, tile: Tile, tiling: Tiling, core: Window, grid: Grid, beyond: str = "symmetric"
+) -> np.ndarray:
     """What a network sees of a tile, (s, s, …), cut from the image of its block (its `core` grown by the margin).
 
     Beyond the grid it sees the tile's own part of the grid mirrored: repeated border pixels are streaks, which pass for roofs.
+    `beyond` is a mode of `numpy.pad`.
     """
     window = tiling.window(tile)
     inside = window.within(grid)
-    rows = mirrored(window.row, inside.row, window.height, inside.height) - core.row + tiling.margin
-    cols = mirrored(window.col, inside.col, window.width, inside.width) - core.col + tiling.margin
-    return image[rows[:, None], cols]
-
-
-def mirrored(start: int, first: int, length: int, count: int) -> np.ndarray:
-    """Indices (length,) from `start` on, those outside the `count` from `first` on mirrored at the ends, again and again."""
-    steps = (np.arange(length) + start - first) % (2 * count)
-    return first + np.minimum(steps, 2 * count - 1 - steps)
+    place = window_in_block(inside, core, tiling.margin)
+    part = image[place.row : place.row + place.height, place.col : place.col + place.width]
+    top, left = inside.row - window.row, inside.col - window.col
+    around = [(top, window.height - top - inside.height), (left, window.width - left - inside.width)]
+    return np.pad(part, around + [(0, 0)] * (image.ndim - 2), beyond)
 
 
 def inner_links(views: list[View], margin: int, rule: str = "overlap") -> np.ndarray:
