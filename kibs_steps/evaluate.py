@@ -327,7 +327,7 @@ def draw(
     left, right = (np.clip(image, 0, 255).astype(np.uint8) for image in (left, right))
 
     drawn = [(sections.seen, (255, 255, 255)), (outlines, (250, 215, 60))]
-    shapes = np.concatenate([shapely.force_2d(o) for o, _ in drawn])
+    shapes = np.concatenate([shapely.to_wkb(shapely.force_2d(o)) for o, _ in drawn])
     ink = np.concatenate([np.tile(np.uint8(c), (len(o), 1)) for o, c in drawn])
     panels = [picture.paint(left, shapes, ink, scale, cover=0.0, width=0.8), Image.fromarray(right)]
     one = figures["heights"]["found"]["all"]

@@ -6,6 +6,7 @@ smooth lines. Pictures need Pillow alone, and the same content gives the same by
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from PIL import Image, ImageDraw, ImageFont
 from kibs_steps import imagery, store, tiles
 from kibs_steps.scene import Scene
 
+AT_ONCE = 2048  # px: side of what is read of a raster at once
+SOME = 4096  # outlines that are points at once
 FINER = 2  # how much larger than the result everything is drawn
 INK, PAPER, QUIET = (38, 42, 46), (250, 249, 246), (122, 128, 134)
 HEIGHTS = np.array(  # dark blue over green to pale yellow: even steps of lightness, safe for colour-blind eyes
@@ -35,11 +38,14 @@ def overview(scene: Scene, longest: int) -> tuple[NDArray[np.uint8], float]:
     scale = min(longest / max(grid.width, grid.height), 4.0)
     size = {"width": max(1, round(grid.width * scale)), "height": max(1, round(grid.height * scale))}
     coarse = grid._replace(gsd=grid.gsd / scale, **size)
-    with imagery.opened(scene.raster) as source, tiles.on_grid(source, coarse, scene.nodata) as warped:
-        values = warped.read([*scene.bands, warped.colorinterp.index(ColorInterp.alpha) + 1])
-    values, valid = values[:3], values[3] > 0
-    rgb = imagery.stretched(values, scene.stretch).transpose(1, 2, 0).copy()
-    rgb[~valid] = PAPER
+    rgb = np.empty((coarse.height, coarse.width, 3), np.uint8)
+    with imagery.opened(scene.raster) as source:
+        for window in coarse.windows(max(1, int(AT_ONCE * scale))):
+            with tiles.on_grid(source, coarse.part(window), scene.nodata) as warped:
+                values = warped.read([*scene.bands, warped.colorinterp.index(ColorInterp.alpha) + 1])
+            part = imagery.stretched(values[:3], scene.stretch).transpose(1, 2, 0).copy()
+            part[values[3] == 0] = PAPER
+            rgb[window.row : window.row + window.height, window.col : window.col + window.width] = part
     return rgb, scale
 
 
@@ -68,12 +74,15 @@ def directions(slope: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDAr
     return np.rint(np.array(rgb).reshape(-1, 3) * 255).astype(np.uint8)
 
 
-def rings(outlines: NDArray[np.object_], scale: float) -> list[list[list[float]]]:
-    """Per outline its rings, outer one first, as x, y, x, y, … in picture pixels."""
-    parts, owner = shapely.get_rings(outlines, return_index=True)
-    points, ring = shapely.get_coordinates(parts, return_index=True)
-    flat = [part.ravel().tolist() for part in np.split(points * scale, np.flatnonzero(np.diff(ring)) + 1)]
-    return [flat[start:end] for start, end in pairwise(np.searchsorted(owner, np.arange(len(outlines) + 1)))]
+def rings(outlines: NDArray[np.object_], scale: float) -> Iterator[list[list[float]]]:
+    """Per outline (WKB, px) its rings, outer one first, as x, y, x, y, … in picture pixels; some outlines at a time."""
+    for start in range(0, len(outlines), SOME):
+        some = shapely.from_wkb(outlines[start : start + SOME])
+        parts, owner = shapely.get_rings(some, return_index=True)
+        points, ring = shapely.get_coordinates(parts, return_index=True)
+        flat = [part.ravel().tolist() for part in np.split(points * scale, np.flatnonzero(np.diff(ring)) + 1)]
+        for first, last in pairwise(np.searchsorted(owner, np.arange(len(some) + 1))):
+            yield flat[first:last]
 
 
 def paint(
@@ -84,22 +93,23 @@ def paint(
     cover: float = 0.45,
     width: float = 1.5,
 ) -> Image.Image:
-    """An image with outlines (px, `scale` picture pixels each) filled by `cover` (0–1) of their colour and drawn around."""
+    """An image with outlines (WKB, px, `scale` picture pixels each) filled by `cover` (0–1) of their colour and drawn around."""
     size = (rgb.shape[1] * FINER, rgb.shape[0] * FINER)
     base = Image.fromarray(rgb).resize(size, Image.Resampling.BICUBIC)
-    fill = base.copy()
-    draw = ImageDraw.Draw(fill)
-    shapes = list(zip(rings(outlines, scale * FINER), map(tuple, colours.tolist()), strict=True))
-    for (shell, *holes), colour in shapes if cover else ():
-        if holes:
-            fill_around(fill, shell, holes, colour)
-        else:
-            draw.polygon(shell, fill=colour)
-    picture = Image.blend(base, fill, cover)
+    picture = base
+    if cover:
+        fill = base.copy()
+        draw = ImageDraw.Draw(fill)
+        for (shell, *holes), ink in zip(rings(outlines, scale * FINER), colours, strict=True):
+            if holes:
+                fill_around(fill, shell, holes, tuple(ink.tolist()))
+            else:
+                draw.polygon(shell, fill=tuple(ink.tolist()))
+        picture = Image.blend(base, fill, cover)
     draw = ImageDraw.Draw(picture)
-    for parts, colour in shapes:
+    for parts, ink in zip(rings(outlines, scale * FINER), colours, strict=True):
         for ring in parts:
-            draw.line(ring, fill=colour, width=max(1, round(width * FINER)))
+            draw.line(ring, fill=tuple(ink.tolist()), width=max(1, round(width * FINER)))
     return picture.resize((rgb.shape[1], rgb.shape[0]), Image.Resampling.BOX)
 
 

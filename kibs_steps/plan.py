@@ -28,7 +28,7 @@ DEFAULTS = {
     "method": "two_stage",
     "mode": "default",
     "planes": "robust",
-    "block": 8,
+    "block": 4,
     "feed": "models",
     "truth_frame": "map",
     "truth_z": "absolute",

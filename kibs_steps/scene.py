@@ -106,9 +106,11 @@ class Scene(NamedTuple):
             return np.broadcast_to(np.array(self.lean, float), (len(seen), 2))
         return np.array([v.lean if v else (0.0, 0.0) for v in self.views(seen)], float).reshape(-1, 2)
 
-    def terrain(self, bounds: tuple[float, float, float, float], margin: float = 200.0) -> terrain.Terrain:
-        """The DTM around `bounds` (left, bottom, right, top, map metres)."""
-        return terrain.read(self.folder / "dtm.tif", bounds, margin)
+    def terrain(
+        self, bounds: tuple[float, float, float, float], margin: float = 200.0, step: float = 0.0
+    ) -> terrain.Terrain:
+        """The DTM around `bounds` (left, bottom, right, top, map metres), no finer than a `step` (m) asks for."""
+        return terrain.read(self.folder / "dtm.tif", bounds, margin, step)
 
     def projected_on(self, dtm: Surface) -> Surface:
         """The surface the image was projected on: the DTM, or the constant `projection_height`."""

@@ -165,18 +165,21 @@ def merged(paths: list[str] | list[Path], order: list[str], columns: list[str] |
     import pyarrow.parquet as pq
 
     groups = []
+    held = None
     for path in paths:
         with sums.opened(path) as file:
             try:
                 facts = pq.read_metadata(file)
             except (pa.ArrowInvalid, OSError) as error:
                 raise sums.damaged(path, error) from error
-        key = facts.schema.to_arrow_schema().names.index(order[0])
+        schema = facts.schema.to_arrow_schema()
+        if held is None:
+            held = schema.empty_table().select(columns or schema.names)
+        key = schema.names.index(order[0])
         some = ((facts.row_group(i), i) for i in range(facts.num_row_groups))
         groups += [(g.column(key).statistics.min, str(path), i) for g, i in some if g.num_rows]
     groups.sort()
     by = [(name, "ascending") for name in order]
-    held = read_table(paths[0], columns).slice(0, 0)
     if not groups:
         yield held
     for k, (_, path, i) in enumerate(groups):

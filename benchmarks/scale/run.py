@@ -40,7 +40,8 @@ SIZES = {
     "86": (8687, 9890),
     "804": (30564, 26320),
 }  # Mpx: px; the last two the paper's
-FLOOD_SIDES = [2048, 3072, 5120]  # px: beyond what a processor keeps in its cache, as a city is
+FLOOD_SIDES = [3072, 4096, 5120]  # px: beyond what a processor keeps in its cache, as a city is
+PAPER_TILES = {"86": 1755, "804": 18400}  # at the paper's stride
 UNEQUAL = ("run.json", ".fingerprints.json")  # what two runs may differ in
 
 
@@ -190,24 +191,29 @@ def table(known: dict[str, Any], cores: int) -> str:
         ]
     lines += ["", "The paper's way, same cores:", ""]
     if pair and floor and "per_tile" in pair:
+        paper = pair["per_tile"] * PAPER_TILES["86"]
+        ours = floor["per_tile"] * tiles_of(*SIZES["86"], floor["stride"])
         lines.append(
-            f"- its two Mask R-CNNs (random weights): {pair['per_tile']:.2f} s per tile, ours {floor['per_tile']:.3f} s: "
-            f"{pair['per_tile'] / floor['per_tile']:.0f} ×"
+            f"- its two Mask R-CNNs (random weights): {pair['per_tile']:.2f} s per tile, {paper:.0f} s for the "
+            f"{PAPER_TILES['86']:,} tiles of 86 Mpx; our networks {ours:.0f} s: {paper / ours:.0f} ×"
         )
     elif pair:
         lines.append(f"- its two Mask R-CNNs: not measured ({pair['reason']})")
     flooding = values.get("flood fill")
     if flooding:
-        city = flooding["factor"] * 85.9 ** flooding["exponent"]
         lines.append(
             f"- labelling by flood_fill: {flooding['seconds']} s at {flooding['mpx']} Mpx, growing with size to the power "
-            f"{flooding['exponent']}; extrapolated to 86 Mpx by that law: {city / 3600:.1f} h"
+            f"{flooding['exponent']}"
         )
-        if pair and "per_tile" in pair and "workflow 86" in values:
-            paper = city + pair["per_tile"] * 1755
-            lines.append(
-                f"- models and labelling of the paper against our whole road: {paper / values['workflow 86']['wall']:.0f} ×"
-            )
+        for size in PAPER_TILES:
+            city = flooding["factor"] * (SIZES[size][0] * SIZES[size][1] / 1e6) ** flooding["exponent"]
+            line = f"- {size} Mpx: labelling {city / 3600:.1f} h by that law"
+            run = values.get(f"workflow {size}")
+            if pair and "per_tile" in pair and run:
+                paper = city + pair["per_tile"] * PAPER_TILES[size]
+                line += f"; models and labelling {paper / 3600:.1f} h, our whole road {run['wall']:.0f} s: "
+                line += f"{paper / run['wall']:.0f} ×"
+            lines.append(line)
     return "\n".join(lines) + "\n"
 
 
@@ -220,7 +226,7 @@ def main() -> None:
     parser.add_argument("--one-core", nargs="*", choices=list(SIZES), default=[], help="Mpx to run on one core too")
     parser.add_argument("--models", default="research", help="a model set, as the workflow's key")
     parser.add_argument("--library", type=int, default=24, help="simulated scenes that the rasters are made of")
-    parser.add_argument("--floor-tiles", type=int, default=64, help="tiles per core that the floor is measured on")
+    parser.add_argument("--floor-tiles", type=int, default=16, help="tiles per core that the floor is measured on")
     parser.add_argument(
         "--pair-tiles", type=int, default=4, help="tiles the paper's networks are measured on; 0: not at all"
     )

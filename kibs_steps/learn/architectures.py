@@ -107,14 +107,9 @@ class InvertedResidual(nn.Module):
 
 
 class Encoder(nn.Module):
-    """EfficientNet-lite0 without its classifier; gives the features at strides 2, 4, 8, 16 and 32.
-
-    The stem and the blocks up to stride 4 stay as they are: they hold what all photographs share, and half the cost of a
-    training step would be theirs.
-    """
+    """EfficientNet-lite0 without its classifier; gives the features at strides 2, 4, 8, 16 and 32."""
 
     channels = (16, 24, 40, 112, 320)
-    fixed = 3  # blocks
 
     def __init__(self) -> None:
         super().__init__()
@@ -132,21 +127,10 @@ class Encoder(nn.Module):
         self.last.append(len(blocks) - 1)
         self._blocks = nn.ModuleList(blocks)
 
-    def train(self, mode: bool = True) -> Encoder:
-        super().train(mode)
-        for part in (self._bn0, *self._blocks[: self.fixed]):
-            part.eval()
-        return self
-
     def forward(self, x: torch.Tensor) -> list[torch.Tensor]:
         features = []
-        with torch.no_grad():
-            x = F.relu6(self._bn0(self._conv_stem(F.pad(x, _same(3, 2)))))
-            for i, block in enumerate(self._blocks[: self.fixed]):
-                x = block(x)
-                if i in self.last:
-                    features.append(x)
-        for i, block in enumerate(self._blocks[self.fixed :], start=self.fixed):
+        x = F.relu6(self._bn0(self._conv_stem(F.pad(x, _same(3, 2)))))
+        for i, block in enumerate(self._blocks):
             x = block(x)
             if i in self.last:
                 features.append(x)
@@ -182,6 +166,26 @@ class Residual(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x + self.norm(self.second(self.first(x)))
+
+
+class Fine(nn.Module):
+    """A correction of the sections' maps at stride 1, of the image's pixels and the features at stride 2; none at the start.
+
+    Rims, small sections and dormers are a few pixels wide: at stride 2 their places are told by channels alone.
+    """
+
+    def __init__(self, channels_in: int, channels: int, depth: int, maps: int):
+        super().__init__()
+        self.pixels = nn.Conv2d(3, channels, 3, padding=1, bias=False)
+        self.spread = nn.Sequential(nn.Conv2d(channels_in, 4 * channels, 1, bias=False), nn.PixelShuffle(2))
+        self.norm = _norm(channels)
+        self.deeper = nn.Sequential(*(Residual(channels) for _ in range(depth)))
+        self.out = nn.Conv2d(channels, maps, 1)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, image: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        return self.out(self.deeper(F.relu(self.norm(self.pixels(image) + self.spread(features)))))
 
 
 class Modulation(nn.Module):
@@ -257,8 +261,8 @@ class Heights(nn.Module):
 class Dense(nn.Module):
     """A network for one task or both; `forward` gives the maps of its `task`, in the order of OUTPUTS[task].
 
-    The image itself joins at stride 2 with its 2×2 pixels as channels, and the maps leave by a pixel shuffle, so lines one
-    pixel wide survive at the cost of stride 2.
+    The image itself joins at stride 2 with its 2×2 pixels as channels, and the maps leave by a pixel shuffle; a few channels
+    at stride 1 (`Fine`) draw the lines of sections.
     """
 
     widths = (32, 40, 48, 64, 96)  # decoder channels at strides 2, 4, 8, 16, 32
@@ -284,6 +288,7 @@ class Dense(nn.Module):
         bias = self.maps[0].bias.data
         bias.fill_(-2.0)
         bias[-4 * CHANNELS["offset"] :] = 0.0
+        self.fine = Fine(self.widths[0], 16, 2, len(OUTPUTS["sections"]))
         self.surface = nn.Conv2d(self.widths[1], SURFACES, 1)
         self.heights = Heights(self.widths[1], bins)
 
@@ -304,8 +309,12 @@ class Dense(nn.Module):
             x = self.deeper[i](x)
             if i == 1:
                 stride_4 = x
-        maps = torch.split(self.maps(self.refine(x)), list(CHANNELS.values()), dim=1)
+        x = self.refine(x)
+        maps = torch.split(self.maps(x), list(CHANNELS.values()), dim=1)
         raw = dict(zip(CHANNELS, maps, strict=True))
+        if self.task != "corners":
+            finer = self.fine(image, x).split(1, dim=1)
+            raw |= {name: raw[name] + more for name, more in zip(OUTPUTS["sections"], finer, strict=True)}
         raw["surface"] = self.surface(stride_4)
         if self.task != "sections":
             raw["height"], raw["slope"] = self.heights(stride_4, raw["surface"], geometry)

@@ -20,7 +20,7 @@ from kibs_steps.learn import dataset, losses, maskrcnn, training
 from kibs_steps.learn.architectures import OUTPUTS
 from kibs_steps.models import contract as contracts
 
-TILE, MARGIN = 256, 16
+TILE, MARGIN = 512, 32
 THRESHOLDS = {
     "sections": {"roof": 0.5, "prominence": 0.2, "min_area": 12},
     "corners": {"corner": 0.3, "corner_radius": 7.5},

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import rasterio
-import shapely
 from numpy.typing import NDArray
 
 from kibs_steps import cli, view, zbuffer
@@ -26,17 +25,19 @@ from kibs_steps.publish.rasters import CACHE, SIDE, cloud_optimized
 
 class Roofs(NamedTuple):
     """Roof faces of the whole city as numbers: `points` (n, 3) map m of all rings, how many of them each ring has, how many
-    rings each face has, and a tree of the faces' boxes in plan."""
+    rings each face has, and the faces' boxes in plan (left, bottom, right, top)."""
 
     points: NDArray[np.float64]
     ends: NDArray[np.int64]  # of rings, in `points`
     last: NDArray[np.int64]  # of faces, in `ends`
-    tree: shapely.STRtree
+    boxes: NDArray[np.float64]
 
     def over(self, frame: Grid) -> list[zbuffer.Polygon]:
-        """The faces whose boxes meet a frame, in a fixed order."""
+        """The faces whose boxes meet a frame, in order."""
+        left, bottom, right, top = frame.bounds
+        x0, y0, x1, y1 = self.boxes.T
         found = []
-        for face in sorted(self.tree.query(shapely.box(*frame.bounds))):
+        for face in np.flatnonzero((x0 <= right) & (x1 >= left) & (y0 <= top) & (y1 >= bottom)):
             rings = range(self.last[face - 1] if face else 0, self.last[face])
             ring, *holes = (self.points[self.ends[r - 1] if r else 0 : self.ends[r]] for r in rings)
             found.append(zbuffer.Polygon(ring, tuple(holes)))
@@ -48,12 +49,14 @@ def roofs(found: Iterable[Mesh]) -> Roofs:
     points, lengths, counts, boxes = [np.zeros((0, 3))], [], [], [np.zeros((0, 4))]
     for mesh in found:
         rings = [face for face, kind in zip(mesh.rings, mesh.kind, strict=True) if KINDS[kind] == "RoofSurface"]
+        if not rings:
+            continue
         counts += map(len, rings)
         lengths += [len(ring) for face in rings for ring in face]
-        points += [ring for face in rings for ring in face]
-        boxes += [np.r_[face[0][:, :2].min(axis=0), face[0][:, :2].max(axis=0)][None] for face in rings]
-    tree = shapely.STRtree(shapely.box(*np.concatenate(boxes).T))
-    return Roofs(np.concatenate(points), np.cumsum(lengths, dtype=np.int64), np.cumsum(counts, dtype=np.int64), tree)
+        points.append(np.concatenate([ring for face in rings for ring in face]))
+        boxes.append(np.array([[*face[0][:, :2].min(axis=0), *face[0][:, :2].max(axis=0)] for face in rings]))
+    ends, last = (np.cumsum(numbers, dtype=np.int64) for numbers in (lengths, counts))
+    return Roofs(np.concatenate(points), ends, last, np.concatenate(boxes))
 
 
 def surface(found: Roofs, frame: Grid, terrain: view.Surface) -> NDArray[np.float32]:

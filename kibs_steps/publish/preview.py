@@ -18,8 +18,9 @@ import shapely
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 
-from kibs_steps import cli, picture, store, terrain
+from kibs_steps import cli, picture, store
 from kibs_steps import scene as scenes
+from kibs_steps.grid import Grid
 from kibs_steps.picture import FINER
 from kibs_steps.scene import Scene
 
@@ -66,7 +67,7 @@ def terrain_shade(scene: Scene, size: tuple[int, int], scale: float) -> NDArray[
     cols, rows = np.meshgrid(np.arange(0, size[0] + step, step), np.arange(0, size[1] + step, step))
     place = scene.grid.to_map(np.stack([cols, rows], axis=-1).reshape(-1, 2) / scale)
     metres = step * scene.grid.gsd / scale
-    heights = terrain.read(scene.folder / "dtm.tif", scene.grid.bounds, step=metres)(place).reshape(cols.shape)
+    heights = scene.terrain(scene.grid.bounds, step=metres)(place).reshape(cols.shape)
     down, along = np.gradient(heights, metres)
     base = np.full((*heights.shape, 3), (232, 231, 225), np.uint8)
     relief = Image.fromarray(shaded(base, 2 * along, -2 * down))
@@ -77,36 +78,45 @@ def standing_panel(
     scene: Scene, outlines: NDArray[np.object_], planes: NDArray[np.float64], heights: NDArray[np.float64], size: tuple[int, int],
     scale: float,
 ) -> tuple[Image.Image, float]:  # fmt: skip
-    """The map view: roofs (map frame) over relief; `planes` (n, 2) are gradients, `heights` (n,) m above ground."""
+    """The map view: roofs over relief; `outlines` (WKB, px) where they stand, `planes` (n, 2) their gradients, `heights` (n,) m
+    above ground."""
     large = (size[0] * FINER, size[1] * FINER)
     page = Image.fromarray(terrain_shade(scene, size, scale)).resize(large, Image.Resampling.BICUBIC)
     colours, top = by_height(heights)
-    lit = shaded(colours, planes[:, 0], planes[:, 1]).tolist()
-    moved = shapely.transform(outlines, scene.grid.to_image)
-    pixels = picture.rings(moved, scale * FINER)
-    away = SHADOW * np.maximum(heights, 0.0)[:, None] / scene.grid.gsd
+    lit = shaded(colours, planes[:, 0], planes[:, 1])
     shadow = Image.new("L", large)
     pen = ImageDraw.Draw(shadow)
-    for shell, *_ in picture.rings(_swept(moved, away), scale * FINER):
+    for shell, *_ in picture.rings(_shadows(outlines, heights, scene.grid.gsd), scale * FINER):
         pen.polygon(shell, fill=110)
     shadow = shadow.filter(ImageFilter.GaussianBlur(1.2 * FINER))
     page.paste((40, 44, 60), (0, 0), shadow)
     pen = ImageDraw.Draw(page)
     # From low to high, so that what stands above is drawn last.
-    for i in np.argsort(heights, kind="stable"):
-        shell, *holes = pixels[i]
+    upwards = np.argsort(heights, kind="stable")
+    for (shell, *holes), colour in zip(picture.rings(outlines[upwards], scale * FINER), lit[upwards], strict=True):
+        ink = tuple(colour.tolist())
         if holes:
-            picture.fill_around(page, shell, holes, tuple(lit[i]))
+            picture.fill_around(page, shell, holes, ink)
             pen = ImageDraw.Draw(page)
         else:
-            pen.polygon(shell, fill=tuple(lit[i]))
+            pen.polygon(shell, fill=ink)
         for ring in (shell, *holes):
-            pen.line(ring, fill=tuple(int(c * 0.55) for c in lit[i]), width=FINER)
+            pen.line(ring, fill=tuple(int(c * 0.55) for c in ink), width=FINER)
     return page.resize(size, Image.Resampling.BOX), top
 
 
+def _shadows(outlines: NDArray[np.object_], heights: NDArray[np.float64], gsd: float) -> NDArray[np.object_]:
+    """What outlines (WKB, px) at heights (m) shade of level ground, without the notches (WKB, px); some at a time."""
+    found = [np.zeros(0, object)]
+    for start in range(0, len(outlines), picture.SOME):
+        some = slice(start, start + picture.SOME)
+        away = SHADOW * np.maximum(heights[some], 0.0)[:, None] / gsd
+        found.append(shapely.to_wkb(_swept(shapely.from_wkb(outlines[some]), away)))
+    return np.concatenate(found)
+
+
 def _swept(outlines: NDArray[np.object_], away: NDArray[np.float64]) -> NDArray[np.object_]:
-    """The areas that outlines cover on their way along vectors (n, 2): shadows on level ground, without the notches."""
+    """The areas that outlines cover on their way along vectors (n, 2), made convex."""
     shells = shapely.get_exterior_ring(outlines)
     owner = shapely.get_coordinates(shells, return_index=True)[1]
     ends = shapely.set_coordinates(shells.copy(), shapely.get_coordinates(shells) + away[owner])
@@ -130,7 +140,7 @@ def compass(page: Image.Image, centre: tuple[int, int], radius: int) -> None:
 
 
 class Shown(NamedTuple):
-    """What the picture shows of the sections, in order of ids: outlines as seen (px) and as they stand (map m), no finer than it
+    """What the picture shows of the sections, in order of ids: outlines as seen and as they stand (WKB, px), no finer than it
     can show, their areas (px), buildings, and numbers by name."""
 
     seen: NDArray[np.object_]
@@ -140,27 +150,32 @@ class Shown(NamedTuple):
     value: dict[str, NDArray[np.float64]]
 
 
-def shown(tables: Iterable[pa.Table], scale: float, gsd: float) -> Shown:
-    """Reads sections (`buildings.parquet`), some at a time; `scale` is picture pixels per pixel of the grid."""
+def shown(tables: Iterable[pa.Table], scale: float, grid: Grid) -> Shown:
+    """Reads sections (`buildings.parquet`), some at a time; `scale` is picture pixels per pixel of the grid.
+
+    Outlines are kept as WKB: of a large city, geometries would be most of the memory.
+    """
     kept: dict[str, list[NDArray]] = defaultdict(list)
     for some in tables:
-        for name, finest in (("outline", UNSEEN / scale), ("outline_map", UNSEEN / scale * gsd)):
-            shapes = shapely.from_wkb(some[name].to_numpy())
-            if name == "outline":
-                kept["area"].append(shapely.area(shapes))
-            kept[name].append(shapely.simplify(shapely.force_2d(shapes), finest))
+        seen = shapely.force_2d(shapely.from_wkb(some["outline"].to_numpy()))
+        standing = shapely.force_2d(shapely.from_wkb(some["outline_map"].to_numpy()))
+        kept["area"].append(shapely.area(seen))
+        kept["seen"].append(shapely.to_wkb(shapely.simplify(seen, UNSEEN / scale)))
+        kept["standing"].append(
+            shapely.to_wkb(shapely.simplify(shapely.transform(standing, grid.to_image), UNSEEN / scale))
+        )
         kept["building"].append(some["building_id"].to_numpy())
         for name in VALUES:
             kept[name].append(some[name].to_numpy().astype(float))
     found = {name: np.concatenate(parts) for name, parts in kept.items()}
     numbers = {name: found[name] for name in VALUES}
-    return Shown(found["outline"], found["outline_map"], found["area"], found["building"], numbers)
+    return Shown(found["seen"], found["standing"], found["area"], found["building"], numbers)
 
 
 def preview(scene: Scene, tables: Iterable[pa.Table]) -> Image.Image:
     """The whole picture of a scene's sections (`buildings.parquet`, in order of ids)."""
     rgb, scale = picture.overview(scene, LONGEST)
-    seen, standing, area, building, value = shown(tables, scale, scene.grid.gsd)
+    seen, standing, area, building, value = shown(tables, scale, scene.grid)
     facing = picture.directions(value["slope"], value["azimuth"])
     typical = np.sqrt(np.median(area)) * scale if len(seen) else 10.0
     width = float(np.clip(typical / 18, 0.5, 1.6))  # thin lines over many small roofs

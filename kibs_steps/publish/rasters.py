@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 import rasterio
 import shapely
 from numpy.typing import NDArray
@@ -58,14 +57,17 @@ class Sections(NamedTuple):
 
 def read(paths: list[str]) -> Sections:
     """Read the sections with planes of all blocks. Raises `IdsTooLarge` for a grid beyond 65,536 px square."""
-    columns = ["section_id", "outline", *PLANE]
-    table = pa.concat_tables([store.read_table(path, columns) for path in paths]).sort_by("section_id")
-    planes = np.column_stack([table[name].to_numpy().astype(float) for name in PLANE]).reshape(-1, 5)
-    known = np.isfinite(planes).all(axis=1)
-    ids, outlines = table["section_id"].to_numpy()[known], table["outline"].to_numpy()[known]
-    if len(ids) and ids[-1] > np.iinfo(np.uint32).max:
-        raise IdsTooLarge(f"section id {ids[-1]} does not fit labels.tif (uint32): cut the raster with aoi=FILE")
-    return Sections(ids, outlines, shapely.bounds(shapely.from_wkb(outlines)).reshape(-1, 4), planes[known])
+    parts = []
+    for some in store.merged(paths, ["section_id"], ["section_id", "outline", *PLANE]):
+        planes = np.column_stack([some[name].to_numpy().astype(float) for name in PLANE]).reshape(-1, 5)
+        known = np.isfinite(planes).all(axis=1)
+        outlines = some["outline"].to_numpy()[known]
+        bounds = shapely.bounds(shapely.from_wkb(outlines)).reshape(-1, 4)
+        parts.append((some["section_id"].to_numpy()[known], outlines, bounds, planes[known]))
+    found = Sections(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    if len(found.ids) and found.ids[-1] > np.iinfo(np.uint32).max:
+        raise IdsTooLarge(f"section id {found.ids[-1]} does not fit labels.tif (uint32): cut the raster with aoi=FILE")
+    return found
 
 
 def shown(sections: Sections, scene: Scene, window: Window) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:

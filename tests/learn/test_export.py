@@ -19,7 +19,7 @@ def test_onnx_equals_torch(task, tmp_path):
         "upright": False,
         "flips": 1,
     }  # the graph itself
-    contract["tile"] = 64
+    contract["tile"], contract["margin"] = 64, 8
     export.export(model, tmp_path / "model.onnx", contract)
     loaded = contracts.load(tmp_path / "model.onnx", task)
     assert loaded.contract == contract

@@ -38,12 +38,25 @@ def test_a_large_raster_is_decimated(tmp_path):
     assert scale == pytest.approx(0.4)
 
 
+def test_pictures_do_not_depend_on_how_much_is_read_at_once(tmp_path, monkeypatch):
+    scene = toy.make_scene(tmp_path, size=(700, 500))
+    table = toy.buildings_table(scene)
+    whole, _ = picture.overview(scene, 350)
+    drawn = draw(tmp_path, scene, table).read_bytes()
+    monkeypatch.setattr(picture, "AT_ONCE", 130)
+    monkeypatch.setattr(picture, "SOME", 1)
+    parts, _ = picture.overview(scene, 350)
+    assert np.array_equal(parts, whole)
+    assert draw(tmp_path, scene, table).read_bytes() == drawn
+
+
 def test_roofs_are_painted_where_they_are(tmp_path):
     """On the right panel a roof's own colour fills its place on the map; the courtyard is ground."""
     scene = toy.make_scene(tmp_path)
     outline = toy.roofs()[2][2]
     size, scale = (scene.grid.width * 2, scene.grid.height * 2), 2.0
-    panel, _ = preview.standing_panel(scene, np.array([outline]), np.zeros((1, 2)), np.array([25.0]), size, scale)
+    seen = shapely.to_wkb(shapely.transform([outline], scene.grid.to_image))
+    panel, _ = preview.standing_panel(scene, seen, np.zeros((1, 2)), np.array([25.0]), size, scale)
     pixels = np.asarray(panel).astype(int)
     colour = preview.by_height(np.array([25.0]))[0][0]
     for point, is_roof in (((82, 62), True), ((108, 88), True), ((95, 75), False), ((40, 20), False)):
@@ -54,7 +67,7 @@ def test_roofs_are_painted_where_they_are(tmp_path):
 def test_seen_outlines_are_drawn_on_the_raster():
     rgb = np.full((60, 60, 3), 100, np.uint8)
     square = shapely.Polygon(shapely.box(10, 10, 30, 30).exterior, [shapely.box(15, 15, 25, 25).exterior.coords])
-    drawn = np.asarray(picture.paint(rgb, np.array([square]), np.array([[255, 0, 0]], np.uint8), 2.0, cover=0.5))
+    drawn = np.asarray(picture.paint(rgb, shapely.to_wkb([square]), np.array([[255, 0, 0]], np.uint8), 2.0, cover=0.5))
     np.testing.assert_allclose(drawn[24, 24], [177.5, 50, 50], atol=1)
     assert drawn[40, 40].tolist() == [100, 100, 100]
     assert drawn[4, 4].tolist() == [100, 100, 100]

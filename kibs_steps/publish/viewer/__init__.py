@@ -94,7 +94,8 @@ def terrain_of(scene: Scene, origin: np.ndarray) -> tuple[dict[str, Any], np.nda
     longest = max(right - left, top - bottom)
     cols, rows = (max(2, round(TERRAIN * side / longest)) for side in (right - left, top - bottom))
     x, y = np.meshgrid(np.linspace(left, right, cols), np.linspace(top, bottom, rows))
-    heights = scene.terrain(scene.grid.bounds)(np.column_stack([x.ravel(), y.ravel()]))
+    finest = longest / TERRAIN / 4  # of a fine model only so many heights are read
+    heights = scene.terrain(scene.grid.bounds, step=finest)(np.column_stack([x.ravel(), y.ravel()]))
     extent = {"x0": left - origin[0], "y0": bottom - origin[1], "x1": right - origin[0], "y1": top - origin[1]}
     return {"cols": cols, "rows": rows, **{k: round(v, 3) for k, v in extent.items()}}, heights.astype(np.float32)
 
@@ -126,15 +127,17 @@ def write(out: TextIO, scene: Scene, found: Iterable[Mesh], licence: str) -> Non
     here = resources.files(__package__)
     three = gzip.decompress((here / "three.min.js.gz").read_bytes()).decode()
     text = (here / "viewer.html").read_text(encoding="utf-8")
-    content = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
     parts = {
         "TITLE": html.escape(scene.name),
         "THREE": three,
-        "DATA": content,
         "VIEWER": (here / "viewer.js").read_text(encoding="utf-8"),
     }
-    for piece in re.split(f"@({'|'.join(parts)})@", text):
-        out.write(parts.get(piece, piece))
+    for piece in re.split(f"@({'|'.join(parts)}|DATA)@", text):
+        if piece == "DATA":
+            for some in json.JSONEncoder(separators=(",", ":"), allow_nan=False).iterencode(data):
+                out.write(some.replace("</", "<\\/"))
+        else:
+            out.write(parts.get(piece, piece))
 
 
 def main(argv: list[str] | None = None) -> None:
