@@ -28,6 +28,14 @@ def test_sections_are_flooded_one_by_one_though_they_touch():
     assert not rivals.apart(np.zeros((4, 4), int)).any()
 
 
+def test_some_areas_alone_are_flooded():
+    quilt = np.kron(np.arange(1, 17).reshape(4, 4), np.ones((6, 6), int))
+    assert rivals.flooded(rivals.apart(quilt), 3) == 3
+    found = rivals.growth(lambda side: quilt[:side, :side], [12, 18, 24], fills=2)
+    assert found["mpx"] == pytest.approx([144e-6, 324e-6, 576e-6])
+    assert len(found["seconds"]) == 3
+
+
 def test_a_power_law_is_found():
     sizes = [0.1, 0.4, 1.6]
     assert rivals.law(sizes, [3 * s**1.9 for s in sizes]) == pytest.approx((1.9, 3.0))

@@ -40,7 +40,6 @@ SIZES = {
     "86": (8687, 9890),
     "804": (30564, 26320),
 }  # Mpx: px; the last two the paper's
-FLOOD_SIDES = [3072, 4096, 5120]  # px: beyond what a processor keeps in its cache, as a city is
 PAPER_TILES = {"86": 1755, "804": 18400}  # at the paper's stride
 UNEQUAL = ("run.json", ".fingerprints.json")  # what two runs may differ in
 
@@ -92,6 +91,7 @@ def workflow(size: str, folder: Path, out: Path, models: str, cores: int, nice: 
         "mpx": round(pixels / 1e6, 3),
         "raster_bytes": raw,
         "buildings": sum(map(len, counts)),
+        "sections": pq.read_metadata(results / "buildings.parquet").num_rows,
         "published": watch.used(results) - watch.used(results / "blocks"),
         "sha256": {f.name: digest(f) for f in sorted(results.iterdir()) if f.is_file() and f.name not in UNEQUAL},
     }
@@ -115,13 +115,11 @@ def tiles_of(width: int, height: int, stride: int) -> int:
 
 
 def flood(results: Path) -> dict[str, Any]:
-    """Flood fill on windows of a run's labels, at three sizes; ours is the `stitch` step of the same run."""
+    """One flood fill in a quarter and half the width of a run's labels and in the whole."""
     with rasterio.open(results / "labels.tif") as source:
-        whole = source.read(
-            1, window=((0, min(source.height, FLOOD_SIDES[-1])), (0, min(source.width, FLOOD_SIDES[-1])))
-        )
-    sides = [side for side in FLOOD_SIDES if side <= min(whole.shape)] or [min(whole.shape) // k for k in (4, 2, 1)]
-    return rivals.growth(lambda side: whole[:side, :side], sides)
+        whole = source.read(1)
+    largest = max(whole.shape)
+    return rivals.growth(lambda side: whole[:side, :side], [largest // 4, largest // 2, largest])
 
 
 def measured(out: Path, key: str, measure: Any) -> Any:
@@ -202,14 +200,16 @@ def table(known: dict[str, Any], cores: int) -> str:
     flooding = values.get("flood fill")
     if flooding:
         lines.append(
-            f"- labelling by flood_fill: {flooding['seconds']} s at {flooding['mpx']} Mpx, growing with size to the power "
-            f"{flooding['exponent']}"
+            f"- labelling by flood_fill: {flooding['seconds']} s a section at "
+            f"{[round(size, 1) for size in flooding['mpx']]} Mpx, growing with size to the power {flooding['exponent']}"
         )
         for size in PAPER_TILES:
-            city = flooding["factor"] * (SIZES[size][0] * SIZES[size][1] / 1e6) ** flooding["exponent"]
-            line = f"- {size} Mpx: labelling {city / 3600:.1f} h by that law"
             run = values.get(f"workflow {size}")
-            if pair and "per_tile" in pair and run:
+            if not run:
+                continue
+            city = run["sections"] * flooding["factor"] * run["mpx"] ** flooding["exponent"]
+            line = f"- {size} Mpx: labelling its {run['sections']:,} sections {city / 3600:.1f} h by that law"
+            if pair and "per_tile" in pair:
                 paper = city + pair["per_tile"] * PAPER_TILES[size]
                 line += f"; models and labelling {paper / 3600:.1f} h, our whole road {run['wall']:.0f} s: "
                 line += f"{paper / run['wall']:.0f} ×"
