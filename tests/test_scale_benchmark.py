@@ -30,8 +30,11 @@ def test_sections_are_flooded_one_by_one_though_they_touch():
 
 def test_some_areas_alone_are_flooded():
     quilt = np.kron(np.arange(1, 17).reshape(4, 4), np.ones((6, 6), int))
-    assert rivals.flooded(rivals.apart(quilt), 3) == 3
-    found = rivals.growth(lambda side: quilt[:side, :side], [12, 18, 24], fills=2)
+    roofs = rivals.apart(quilt)
+    assert (
+        len(rivals.fills(roofs, np.flatnonzero(roofs)[[0, 1, 400 - 1]])) == 2
+    )  # the second pixel lies in the first's area
+    found = rivals.growth(lambda side: quilt[:side, :side], [12, 18, 24], most=2)
     assert found["mpx"] == pytest.approx([144e-6, 324e-6, 576e-6])
     assert len(found["seconds"]) == 3
 

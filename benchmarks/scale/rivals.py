@@ -123,21 +123,23 @@ def apart(labels: np.ndarray) -> np.ndarray:
     return roofs
 
 
-def flooded(roofs: np.ndarray, most: int | None = None) -> int:
-    """The paper's labelling of a mask (rows, cols) of roof pixels, area by area; `most`: of so many alone, spread over the
-    mask. Returns how many were filled."""
+def flooded(roofs: np.ndarray) -> int:
+    """The paper's labelling of a mask (rows, cols) of roof pixels: number of areas found."""
+    return len(fills(roofs, np.flatnonzero(roofs)))
+
+
+def fills(roofs: np.ndarray, starts: np.ndarray) -> list[float]:
+    """Seconds of each fill, from those of the pixels `starts` (places in the flattened mask) that no fill has reached yet."""
     from skimage.segmentation import flood_fill
 
-    image = np.where(roofs, -1, 0).astype(np.int32)
-    starts = np.flatnonzero(roofs)
-    if most is not None:
-        starts = starts[np.linspace(0, len(starts) - 1, most).astype(int)]
-    found = 0
+    image = np.where(roofs, np.int32(-1), np.int32(0))
+    spent = []
     for row, col in zip(*np.unravel_index(starts, roofs.shape), strict=True):
         if image[row, col] == -1:
-            found += 1
-            image = flood_fill(image, (int(row), int(col)), found, connectivity=1)
-    return found
+            start = time.monotonic()
+            image = flood_fill(image, (int(row), int(col)), len(spent) + 1, connectivity=1)
+            spent.append(time.monotonic() - start)
+    return spent
 
 
 def law(sizes: list[float], seconds: list[float]) -> tuple[float, float]:
@@ -146,15 +148,15 @@ def law(sizes: list[float], seconds: list[float]) -> tuple[float, float]:
     return float(exponent), float(np.exp(intercept))
 
 
-def growth(labels: Callable[[int], np.ndarray], sides: list[int], fills: int = 12) -> dict[str, Any]:
-    """Seconds of one fill in label images (side, side) of the given sides, a mean of some; the law through them (size in Mpx)."""
+def growth(labels: Callable[[int], np.ndarray], sides: list[int], most: int = 12) -> dict[str, Any]:
+    """Seconds of one fill in label images (side, side) of the given sides, a mean of at most `most`; the law through them (size
+    in Mpx)."""
     flooded(np.ones((2, 2), bool))  # imports what it needs
     sizes, seconds = [], []
     for side in sides:
         roofs = apart(labels(side))
-        start = time.monotonic()
-        count = flooded(roofs, fills)
-        seconds.append((time.monotonic() - start) / count)
+        starts = np.flatnonzero(roofs)
+        seconds.append(float(np.mean(fills(roofs, starts[np.linspace(0, len(starts) - 1, most).astype(int)]))))
         sizes.append(roofs.size / 1e6)
     exponent, factor = law(sizes, seconds)
     return {"mpx": sizes, "seconds": seconds, "exponent": round(exponent, 3), "factor": factor}
