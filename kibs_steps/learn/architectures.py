@@ -168,26 +168,6 @@ class Residual(nn.Module):
         return x + self.norm(self.second(self.first(x)))
 
 
-class Fine(nn.Module):
-    """A correction of the sections' maps at stride 1, of the image's pixels and the features at stride 2; none at the start.
-
-    Rims, small sections and dormers are a few pixels wide: at stride 2 their places are told by channels alone.
-    """
-
-    def __init__(self, channels_in: int, channels: int, depth: int, maps: int):
-        super().__init__()
-        self.pixels = nn.Conv2d(3, channels, 3, padding=1, bias=False)
-        self.spread = nn.Sequential(nn.Conv2d(channels_in, 4 * channels, 1, bias=False), nn.PixelShuffle(2))
-        self.norm = _norm(channels)
-        self.deeper = nn.Sequential(*(Residual(channels) for _ in range(depth)))
-        self.out = nn.Conv2d(channels, maps, 1)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-
-    def forward(self, image: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-        return self.out(self.deeper(F.relu(self.norm(self.pixels(image) + self.spread(features)))))
-
-
 class Modulation(nn.Module):
     """Scales and shifts each channel by what the geometry says (FiLM, Perez et al. 2018); neutral at the start."""
 
@@ -261,16 +241,18 @@ class Heights(nn.Module):
 class Dense(nn.Module):
     """A network for one task or both; `forward` gives the maps of its `task`, in the order of OUTPUTS[task].
 
-    The image itself joins at stride 2 with its 2×2 pixels as channels, and the maps leave by a pixel shuffle; a few channels
-    at stride 1 (`Fine`) draw the lines of sections.
+    The image itself joins at stride 2 with its 2×2 pixels as channels, and the maps leave by a pixel shuffle. With a `zoom` the
+    network sees the image enlarged so many times and gives maps of the image as it is: half of all sections are only a few
+    cells of stride 2 wide. Sides times zoom are multiples of 32.
     """
 
     widths = (32, 40, 48, 64, 96)  # decoder channels at strides 2, 4, 8, 16, 32
     depths = (1, 2, 1, 1)  # residuals at strides 2, 4, 8, 16
 
-    def __init__(self, bins: int, task: str = "both"):
+    def __init__(self, bins: int, task: str = "both", zoom: float = 1.0):
         super().__init__()
         self.task = task
+        self.zoom = zoom
         self.bins = bins
         self.encoder = Encoder()
         self.geometry = nn.Sequential(nn.Linear(GEOMETRY, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU())
@@ -288,7 +270,6 @@ class Dense(nn.Module):
         bias = self.maps[0].bias.data
         bias.fill_(-2.0)
         bias[-4 * CHANNELS["offset"] :] = 0.0
-        self.fine = Fine(self.widths[0], 16, 2, len(OUTPUTS["sections"]))
         self.surface = nn.Conv2d(self.widths[1], SURFACES, 1)
         self.heights = Heights(self.widths[1], bins)
 
@@ -298,6 +279,9 @@ class Dense(nn.Module):
         Offsets (px) and everything at stride 1 before its activation; `surface` (kinds), `height` (bins) and `slope` (m of
         height per px of column and row) at stride 4.
         """
+        if self.zoom != 1:
+            image = resized(image, self.zoom)
+            geometry = torch.cat([geometry[:, :4] * self.zoom, geometry[:, 4:]], dim=1)
         g = self.geometry(geometry)
         features = self.encoder(image)
         features[0] = torch.cat([features[0], self.pixels(F.pixel_unshuffle(image, 2))], dim=1)
@@ -312,12 +296,11 @@ class Dense(nn.Module):
         x = self.refine(x)
         maps = torch.split(self.maps(x), list(CHANNELS.values()), dim=1)
         raw = dict(zip(CHANNELS, maps, strict=True))
-        if self.task != "corners":
-            finer = self.fine(image, x).split(1, dim=1)
-            raw |= {name: raw[name] + more for name, more in zip(OUTPUTS["sections"], finer, strict=True)}
         raw["surface"] = self.surface(stride_4)
         if self.task != "sections":
             raw["height"], raw["slope"] = self.heights(stride_4, raw["surface"], geometry)
+        if self.zoom != 1:
+            raw = {name: resized(x, 1 / self.zoom) for name, x in raw.items()}
         return raw
 
     def forward(self, image: torch.Tensor, geometry: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -325,6 +308,11 @@ class Dense(nn.Module):
         raw = self.logits(image, geometry)
         final = {"offset": lambda x: 0.5 * torch.tanh(x), "height": lambda x: torch.softmax(x, dim=1)}
         return tuple(final.get(name, torch.sigmoid)(raw[name]) for name in OUTPUTS[self.task])
+
+
+def resized(maps: torch.Tensor, factor: float) -> torch.Tensor:
+    """Maps (n, c, h, w) with sides `factor` times as long, bilinear; the maps' own edges stay where they are."""
+    return F.interpolate(maps, scale_factor=factor, mode="bilinear", align_corners=False)
 
 
 def normalised(rgb: torch.Tensor) -> torch.Tensor:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from kibs_steps.simulate.draped import House
 
 GSD = 0.38  # m per px of the models trained here
+AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their source
 UNKNOWN = 255
 NADIR = np.array([0, 0, 0, 0, 1, 0], np.float32)
 
@@ -399,4 +400,4 @@ class Mixture:
                 sample = pasted_houses(sample, self.graphs, rng)
         sample = without_geometry(sample, rng)
         sample = upright(sample, rng) if self.upright else dihedral(sample, int(rng.integers(8)))
-        return sample._replace(rgb=radiometry(sample.rgb, rng))
+        return sample if rng.random() < AS_IT_IS else sample._replace(rgb=radiometry(sample.rgb, rng))

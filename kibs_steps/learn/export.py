@@ -137,7 +137,7 @@ def main(argv: list[str] | None = None) -> None:
     state = torch.load(args.checkpoint, weights_only=True, map_location="cpu")
     task, settings = args.task, training.Settings(**state["settings"])
     average = state.get("best", {}).get("average") or state["average"]
-    model = training.network(task, settings.family)
+    model = training.network(task, settings.family, settings.zoom)
     model.load_state_dict(average)
     about = {**state.get("about", {}), "tiles_seen": state["step"] * settings.batch}
     about |= {"minutes": round(state["seconds"] / 60, 1), "converged": state.get("converged")}

@@ -38,6 +38,7 @@ from kibs_steps.models.contract import ContractMismatch
 DISTANCE_CLIP = 5.0  # px
 BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
 BLENDED = {"sections": 0.0, "both": 0.4, "corners": 1.0}  # share of tiles that are shown blended
+ZOOM = {"sections": 1.5, "both": 1.0, "corners": 1.0}  # `Dense.zoom`
 
 
 class Settings(NamedTuple):
@@ -50,6 +51,7 @@ class Settings(NamedTuple):
     decay: float = 0.02
     family: str = "dense"
     task: str = "both"
+    zoom: float = 1.0
 
 
 class Best(NamedTuple):
@@ -149,9 +151,9 @@ def dense_terms(model: Dense, batch: Batch) -> Batch:
     return losses({k: v.float() for k, v in raw.items()}, batch, model.task)
 
 
-def network(task: str = "both", family: str = "dense") -> nn.Module:
-    """A new network that gives the outputs of a task."""
-    return maskrcnn.network(task) if family == "maskrcnn" else Dense(len(CENTRES), task)
+def network(task: str = "both", family: str = "dense", zoom: float = 1.0) -> nn.Module:
+    """A new network that gives the outputs of a task; a dense one sees the image enlarged `zoom` times."""
+    return maskrcnn.network(task) if family == "maskrcnn" else Dense(len(CENTRES), task, zoom)
 
 
 def moved(batch: Any, device: torch.device) -> Any:
@@ -323,6 +325,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, help="highest learning rate")
     parser.add_argument("--batch", type=int, help="tiles per step")
+    parser.add_argument("--zoom", type=float, help="how many times larger a dense network sees the image")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2, help="of torch, on a CPU")
     parser.add_argument("--workers", type=int, default=1, help="processes that prepare tiles")
@@ -339,8 +342,10 @@ def main(argv: list[str] | None = None) -> None:
         task = args.task or "sections"
         settings = Settings(args.seed, maskrcnn.TILE, args.batch or 2, args.rate or 2e-4, family="maskrcnn", task=task)
     else:
-        settings = Settings(args.seed, batch=args.batch or 8, rate=args.rate or 2e-3, task=args.task or "both")
-    model = network(settings.task, settings.family)
+        task = args.task or "both"
+        rate, zoom = args.rate or 2e-3, args.zoom or ZOOM[task]
+        settings = Settings(args.seed, batch=args.batch or 8, rate=rate, task=task, zoom=zoom)
+    model = network(settings.task, settings.family, settings.zoom)
     if args.init:
         start_from(model, args.init)
     elif args.family == "dense":

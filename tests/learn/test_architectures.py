@@ -29,15 +29,21 @@ def test_sweep_finds_base_and_shadow_of_a_pole():
     assert read[1, 1, :, row, col].argmax() == SWEPT.index(8)
 
 
-def test_the_correction_at_full_resolution_is_neutral_at_the_start_and_then_learns():
+def test_a_zoomed_network_is_the_same_network_on_a_larger_image():
     torch.manual_seed(0)
-    model = training.network("sections").eval()
-    image, geometry = torch.randn(1, 3, 64, 64), torch.zeros(1, 6)
-    assert not model.fine(image, torch.randn(1, model.widths[0], 32, 32)).any()
-    model.train()
-    raw = model.logits(image, geometry)
-    sum(raw[name].square().mean() for name in ("roof", "edge", "distance")).backward()
-    assert model.fine.out.weight.grad.abs().sum() > 0
+    plain = training.network("sections").eval()
+    zoomed = training.network("sections", zoom=1.5).eval()
+    zoomed.load_state_dict(plain.state_dict())
+    small, geometry = torch.rand(1, 3, 64, 64), torch.tensor([[0.2, -1.4, 0.6, 0.3, 1.0, 1.0]])
+    large = torch.nn.functional.interpolate(small, size=(96, 96), mode="bilinear")
+    with torch.no_grad():
+        expected = plain.logits(large, geometry * torch.tensor([[1.5, 1.5, 1.5, 1.5, 1.0, 1.0]]))
+        raw = zoomed.logits(small, geometry)
+    assert raw["roof"].shape == (1, 1, 64, 64)
+    assert raw["surface"].shape[2:] == (16, 16)
+    for name in ("roof", "edge", "distance"):
+        smaller = torch.nn.functional.interpolate(expected[name], size=(64, 64), mode="bilinear")
+        assert torch.allclose(raw[name], smaller, atol=1e-5)
 
 
 def test_all_of_the_encoder_learns():

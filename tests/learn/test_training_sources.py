@@ -44,6 +44,13 @@ def test_own_samples_alone(tmp_path):
     assert about["corner_heights"] == [5.0, 1.0]
 
 
+def test_half_of_the_tiles_keep_their_look(tmp_path):
+    mixture = sources.gather(arguments("--own", str(own(tmp_path / "town")), "--tiles=0"), 48).mixture
+    looks = [np.unique(mixture[i].rgb) for i in range(80)]
+    kept = sum(len(look) == 1 and look[0] in (0, 10, 20, 30) for look in looks)
+    assert 28 <= kept <= 52
+
+
 def test_corner_heights_of_several_data_sets_are_pooled(tmp_path):
     one = own(tmp_path / "a", count=30, mean=4.0, sigma=1.0)
     other = own(tmp_path / "b", view=None, count=10, mean=8.0, sigma=2.0)

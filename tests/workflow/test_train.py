@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pyogrio
@@ -87,3 +91,30 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
     )
     assert refused.returncode != 0
     assert "outside what it was trained on" in refused.stdout + refused.stderr
+
+
+@pytest.mark.long
+def test_training_killed_without_warning_goes_on_from_its_last_checkpoint(tmp_path):
+    import torch
+
+    simulation.main(["--seed=3", "--size=340", "--style=suburb", f"--out={tmp_path / 'known'}"])
+    own = {"name": "known", "raster": "known/scene.tif", "dtm": "known/dtm.tif", "truth": "known/truth.gpkg"}
+    train = {"name": "town", "own": [own], "split": "shuffle", "tiles": 0, "steps": 250, "minutes": 60}
+    (tmp_path / "config.yaml").write_text(json.dumps({"train": train}))
+    run = tmp_path / "runs/town/both"
+    command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", "2", "train"]
+    first = subprocess.Popen(command, cwd=tmp_path, start_new_session=True, stderr=subprocess.DEVNULL)
+    while not (run / "checkpoint.pt").exists():
+        assert first.poll() is None
+        time.sleep(0.5)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.wait()
+    kept = torch.load(run / "checkpoint.pt", weights_only=True)["step"]
+    assert 0 < kept < 250
+
+    snakemake(tmp_path, "train", "--nolock", "--rerun-incomplete")
+    assert json.loads((run / "done.json").read_text())["steps"] == 250
+    said = [
+        int(n) for n in re.findall(r"^step (\d+) ", (tmp_path / "runs/town/logs/training_both.log").read_text(), re.M)
+    ]
+    assert said == [n for n in range(50, 251, 50) if n > kept]
