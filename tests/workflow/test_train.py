@@ -98,9 +98,9 @@ def test_training_killed_without_warning_goes_on_from_its_last_checkpoint(tmp_pa
     import torch
 
     simulation.main(["--seed=3", "--size=340", "--style=suburb", f"--out={tmp_path / 'known'}"])
-    own = {"name": "known", "raster": "known/scene.tif", "dtm": "known/dtm.tif", "truth": "known/truth.gpkg"}
-    train = {"name": "town", "own": [own], "split": "shuffle", "tiles": 0, "steps": 250, "minutes": 60}
-    (tmp_path / "config.yaml").write_text(json.dumps({"train": train}))
+    scene = {"raster": "known/scene.tif", "dtm": "known/dtm.tif", "truth": "known/truth.gpkg"}
+    train = {"name": "town", "own": ["known"], "split": "shuffle", "tiles": 0, "steps": 250, "minutes": 60}
+    (tmp_path / "config.yaml").write_text(json.dumps({"scenes": {"known": scene}, "train": train}))
     run = tmp_path / "runs/town/both"
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", "2", "train"]
     first = subprocess.Popen(command, cwd=tmp_path, start_new_session=True, stderr=subprocess.DEVNULL)
