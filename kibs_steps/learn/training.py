@@ -344,6 +344,8 @@ def main(argv: list[str] | None = None) -> None:
     else:
         task = args.task or "both"
         rate, zoom = args.rate or 2e-3, args.zoom or ZOOM[task]
+        if zoom <= 0 or zoom % 0.5:
+            parser.error(f"--zoom {zoom:g}: it goes by halves (1, 1.5, 2), so that tiles have whole cells of stride 32")
         settings = Settings(args.seed, batch=args.batch or 8, rate=rate, task=task, zoom=zoom)
     model = network(settings.task, settings.family, settings.zoom)
     if args.init:

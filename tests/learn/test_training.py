@@ -104,6 +104,13 @@ def test_a_new_run_takes_over_the_weights_of_another(tmp_path):
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
 
 
+@pytest.mark.parametrize("zoom", ["1.3", "-1"])
+def test_a_zoom_that_cuts_cells_is_refused(zoom, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        training.main([f"--out={tmp_path}", f"--zoom={zoom}", "--tiles=0"])
+    assert "it goes by halves" in capsys.readouterr().err
+
+
 def test_weights_that_are_no_numbers_are_refused(tmp_path):
     model = training.network()
     average = model.state_dict()
