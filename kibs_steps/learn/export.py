@@ -94,7 +94,7 @@ def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float] | 
 def export(model: nn.Module, path: str | Path, contract: dict[str, Any]) -> None:
     """Write a network as ONNX with its contract; the input's side is the contract's tile.
 
-    In a dense network constants are folded and padding becomes a part of its convolution: up to a tenth less work for the runtime.
+    In a dense network constants are folded and padding becomes a part of its convolution: up to a tenth quicker to run.
     """
     import onnx
     import onnxslim
