@@ -33,7 +33,7 @@ def main(argv: list[str] | None = None) -> None:
     city = args.city or (args.data / CITY if args.data and (args.data / CITY).is_file() else None)
     rows: list[dict[str, Any]] = []
     told: dict[str, dict[str, Any]] = {}
-    samples: dict[str, list] = {}
+    samples: dict[float, dict[str, list]] = {}
     for method in found:
         contract = method.models["sections"].contract
         settings = scenes.make(args.work / "scenes", args.size, contract["gsd"], city)
@@ -45,9 +45,13 @@ def main(argv: list[str] | None = None) -> None:
             continue
         kept = place / f"tiles-{fingerprint.of_values(method.signature, args.count, args.per_place)}.json"
         if not kept.is_file():
-            samples = samples or chips.sets(args.data, args.count, args.per_place)
+            gsd = contract["gsd"]
+            if gsd not in samples:
+                samples[gsd] = chips.sets(args.data, args.count, args.per_place, gsd)
             runner = chips.Runner(method)
-            judged = {name: chips.figures(tiles, [runner(tile) for tile in tiles]) for name, tiles in samples.items()}
+            judged = {
+                name: chips.figures(tiles, [runner(tile) for tile in tiles]) for name, tiles in samples[gsd].items()
+            }
             store.write_json(kept, {"sets": judged, "ms_per_tile": 1000 * runner.seconds / max(runner.tiles, 1)})
         content = store.read_json(kept)
         rows += [{"set": name, "method": method.name, **figures} for name, figures in content["sets"].items()]

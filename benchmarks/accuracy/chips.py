@@ -22,6 +22,7 @@ from kibs_steps.learn import dataset, validation
 from kibs_steps.models import heads, runtime
 
 SIDE = 224  # px: within every model's tile, so that all see the same ground
+VILLAGE = 256  # px: holds its scenes of 51.2 m at GSDs down to 0.2 m
 FAR = 100_000  # px between tiles laid side by side for the corner figures
 
 
@@ -33,25 +34,25 @@ class Found(NamedTuple):
     corners: np.ndarray
 
 
-def sets(data: Path, count: int, per_place: int) -> dict[str, list[dataset.Sample]]:
-    """The samples of every set, always the same ones."""
+def sets(data: Path, count: int, per_place: int, gsd: float) -> dict[str, list[dataset.Sample]]:
+    """The samples of every set at the models' GSD, always the same ones."""
     found = {
-        "B photographs": validation.photographed(data, data / "roofgraph" / "roofgraph.tar", count, SIDE),
-        "village": validation.village(data / "village", 256),
+        "B photographs": validation.photographed(data, data / "roofgraph" / "roofgraph.tar", count, SIDE, gsd),
+        "village": validation.village(data / "village", VILLAGE, gsd),
     }
     places: dict[str, list[photographs.Chip]] = {}
     for chip in photographs.read_chips(data / "chips"):
         places.setdefault(chip.name.split("/")[0], []).append(chip)
     for place, chips in places.items():
-        windows = [sample for chip in chips for sample in cut(chip)]
+        windows = [sample for chip in chips for sample in cut(chip, gsd)]
         step = max(1, len(windows) // per_place)
         found[f"C {place}"] = windows[::step][:per_place]
     return {name: [middle(sample) for sample in samples] for name, samples in found.items()}
 
 
-def cut(chip: photographs.Chip) -> list[dataset.Sample]:
-    """Windows of a chip at the models' GSD, side by side: roofs known, nothing else."""
-    scale = chip.gsd / dataset.GSD
+def cut(chip: photographs.Chip, gsd: float) -> list[dataset.Sample]:
+    """Windows of a chip at `gsd`, side by side: roofs known, nothing else."""
+    scale = chip.gsd / gsd
     size = tuple(max(SIDE, round(n * scale)) for n in chip.building.shape[::-1])
     rgb = cv2.resize(chip.rgb, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
     building = cv2.resize(chip.building.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from kibs_steps.simulate.citymodel import CityModel
     from kibs_steps.simulate.draped import House
 
-GSD = 0.38  # m per px of the models trained here
+GSD = 0.38  # m per px of the models trained here, if no other is asked for
 AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their source
 UNKNOWN = 255
+LOOSE = 5  # px, width of the strip about a mask's outline of which nothing is asked
 NADIR = np.array([0, 0, 0, 0, 1, 0], np.float32)
 
 
@@ -67,8 +68,9 @@ def simulated(
     sun: tuple[float, float] | None = None,
     cities: Sequence[CityModel] = (),
     houses: Sequence[House] = (),
+    gsd: float = GSD,
 ) -> Sample:
-    """A tile of the simulator, seen from elevations (deg) in a range, from all sides, lit from anywhere.
+    """A tile of the simulator at about `gsd`, seen from elevations (deg) in a range, from all sides, lit from anywhere.
 
     `backgrounds` are photographs (rgb, usable as ground: bool) for the simulator's ground. `view` and `sun` (azimuth, elevation
     deg) fix the directions but for a degree or two, for models of one scene. Some tiles show one of the real `cities`, some
@@ -76,11 +78,10 @@ def simulated(
     """
     from kibs_steps.simulate.scene import random_scene
 
-    gsd = GSD * rng.uniform(0.9, 1.1)
     rendering, geometry = random_scene(
         rng,
         size=size,
-        gsd=gsd,
+        gsd=gsd * rng.uniform(0.9, 1.1),
         view_elevation=view_elevation,
         backgrounds=backgrounds,
         view=near(view, rng),
@@ -112,9 +113,9 @@ def near(
     return azimuth % 360, float(np.clip(elevation, 5.0, 89.9))
 
 
-def chip_sample(chip: Chip, rng: np.random.Generator, size: int) -> Sample:
-    """A window of a chip, turned and scaled at random: roofs known, sections and corners not."""
-    scale = chip.gsd / GSD * rng.uniform(0.75, 1.35)
+def chip_sample(chip: Chip, rng: np.random.Generator, size: int, gsd: float = GSD) -> Sample:
+    """A window of a chip, turned and scaled at random: roofs known but for their rims, sections and corners not."""
+    scale = chip.gsd / gsd * rng.uniform(0.75, 1.35)
     angle = rng.uniform(0, 2 * np.pi)
     linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     if rng.random() < 0.5:
@@ -129,11 +130,13 @@ def chip_sample(chip: Chip, rng: np.random.Generator, size: int) -> Sample:
     mask = chip.building.astype(np.uint8) * 255
     mask = cv2.warpAffine(mask, affine, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     building = mask > 127
+    # A mask is shifted by a pixel or two and cuts corners: what it says of its outline would teach blurred rims.
+    loose = cv2.morphologyEx(building.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((LOOSE, LOOSE), np.uint8)) > 0
     sample = empty(rgb)
     return sample._replace(
-        labels=np.where(building, -1, 0).astype(np.int32),
-        roof=building.astype(np.uint8),
-        surface=np.where(building, np.uint8(1), sample.surface),
+        labels=np.where(building | loose, -1, 0).astype(np.int32),
+        roof=np.where(loose, np.uint8(UNKNOWN), building.astype(np.uint8)),
+        surface=np.where(building & ~loose, np.uint8(1), sample.surface),
         # A mask's outline is only as good as its annotator: no corners within 3 px of a building are learned either way.
         corners_known=(cv2.dilate(mask, np.ones((7, 7))) <= 127).astype(np.uint8),
         geometry=NADIR.copy() if rng.random() < 0.4 else sample.geometry,
@@ -154,7 +157,11 @@ def with_decoys(sample: Sample, other: Sample, rng: np.random.Generator) -> Samp
 
 
 def pasted_houses(
-    ground: Sample, graphs: Sequence[RoofGraph], rng: np.random.Generator, count: tuple[int, int] = (5, 13)
+    ground: Sample,
+    graphs: Sequence[RoofGraph],
+    rng: np.random.Generator,
+    count: tuple[int, int] = (5, 13),
+    gsd: float = GSD,
 ) -> Sample:
     """Photographed houses pasted into a tile: sections and corners known, heights not.
 
@@ -170,7 +177,7 @@ def pasted_houses(
     label = max(int(labels.max()), 0)
     for _ in range(rng.integers(count[0], count[1] + 1)):
         graph = graphs[rng.integers(len(graphs))]
-        affine = _house_affine(graph, rng, size)
+        affine = _house_affine(graph, rng, size, gsd)
         vertices = graph.vertices @ affine[:, :2].T + affine[:, 2]
         # By pixel centres: OpenCV would draw rims too, and every face half a pixel too wide.
         rings = (vertices[np.append(face, face[0])].tolist() for face in graph.faces)
@@ -215,9 +222,9 @@ def pasted_houses(
     )
 
 
-def _house_affine(graph: RoofGraph, rng: np.random.Generator, size: int) -> np.ndarray:
+def _house_affine(graph: RoofGraph, rng: np.random.Generator, size: int, gsd: float) -> np.ndarray:
     """Tile px of the reduced photograph's px, (2, 3): the house anywhere in the tile, turned, scaled, perhaps mirrored."""
-    scale = REDUCED * GRAPH_GSD / GSD * rng.uniform(0.85, 1.3)
+    scale = REDUCED * GRAPH_GSD / gsd * rng.uniform(0.85, 1.3)
     angle = rng.uniform(0, 2 * np.pi)
     linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     if rng.random() < 0.5:
@@ -355,7 +362,7 @@ class Mixture:
 
     `shares` are the probabilities of (simulated, pasted houses, chips, own). Simulated tiles come from `pool`, a folder of
     kept samples that another process may still be filling; while it is empty, the other sources stand in. `own` are files of
-    kept samples (`learn.own`). Tiles come `upright`, or turned at random.
+    kept samples (`learn.own`), as those at `gsd`. Tiles come `upright`, or turned at random.
     """
 
     def __init__(
@@ -368,8 +375,9 @@ class Mixture:
         seed: int,
         own: Sequence[Path] = (),
         upright: bool = True,
+        gsd: float = GSD,
     ):
-        self.own, self.upright = list(own), upright
+        self.own, self.upright, self.gsd = list(own), upright, gsd
         self.pool, self.graphs, self.chips = pool, graphs, chips
         self.shares, self.size, self.seed = shares, size, seed
         self._kept: list[Path] = []
@@ -392,12 +400,12 @@ class Mixture:
             row, col = rng.integers(0, [n - self.size + 1 for n in sample.labels.shape])
             sample = window(sample, row, col, self.size)
         else:
-            sample = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size)
+            sample = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size, self.gsd)
             if rng.random() < 0.5:
-                other = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size)
+                other = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size, self.gsd)
                 sample = with_decoys(sample, other, rng)
             if source == 1:
-                sample = pasted_houses(sample, self.graphs, rng)
+                sample = pasted_houses(sample, self.graphs, rng, gsd=self.gsd)
         sample = without_geometry(sample, rng)
         sample = upright(sample, rng) if self.upright else dihedral(sample, int(rng.integers(8)))
         return sample if rng.random() < AS_IT_IS else sample._replace(rgb=radiometry(sample.rgb, rng))

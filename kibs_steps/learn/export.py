@@ -20,7 +20,7 @@ from kibs_steps.learn import dataset, losses, maskrcnn, training
 from kibs_steps.learn.architectures import OUTPUTS
 from kibs_steps.models import contract as contracts
 
-TILE, MARGIN = 512, 32
+TILE, MARGIN = 512, 32  # px at dataset.GSD
 THRESHOLDS = {
     "sections": {"roof": 0.5, "prominence": 0.2, "min_area": 12},
     "corners": {"corner": 0.3, "corner_radius": 7.5},
@@ -29,21 +29,32 @@ THRESHOLDS["both"] = THRESHOLDS["sections"] | THRESHOLDS["corners"]
 LICENCE = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
 
 
+def tiling(gsd: float) -> tuple[int, int]:
+    """Tile and margin (px) that show about as much ground at any GSD; whole cells of stride 32 at half zooms too."""
+    share = dataset.GSD / gsd
+    return 64 * max(1, round(TILE * share / 64)), 16 * max(1, round(MARGIN * share / 16))
+
+
 def contract_of(
-    task: str, heights: tuple[float, float] | None = None, family: str = "dense", **facts: Any
+    task: str,
+    heights: tuple[float, float] | None = None,
+    family: str = "dense",
+    gsd: float = dataset.GSD,
+    **facts: Any,
 ) -> dict[str, Any]:
     """The contract of a network trained here.
 
     `heights` are mean and standard deviation (m) of the training set's corners; `facts` replace or add fields of the
     contract: `thresholds` (merged), `metrics`, `score`, and `seed`, `commit`, `about` (what the run was trained on).
     """
+    tile, margin = tiling(gsd)
     contract: dict[str, Any] = {
         "contract": 1,
         "task": task,
         "head": "dense",
-        "gsd": dataset.GSD,
-        "tile": TILE,
-        "margin": MARGIN,
+        "gsd": gsd,
+        "tile": tile,
+        "margin": margin,
         "input": {"channels": "RGB", "scale": 1.0, "mean": [127.0] * 3, "std": [128.0] * 3},
         "geometry_input": True,
         "upright": True,
@@ -161,7 +172,7 @@ def main(argv: list[str] | None = None) -> None:
         facts["metrics"] = report
     if heights is None and args.pool and task != "sections":
         heights = corner_height_moments(Path(args.pool))
-    export(model, args.out, contract_of(task, heights, settings.family, **facts))
+    export(model, args.out, contract_of(task, heights, settings.family, settings.gsd, **facts))
     if args.weights:
         with store.whole(args.weights, summed=False) as temporary:
             torch.save({"average": halved(average), "settings": state["settings"]}, temporary)

@@ -22,6 +22,7 @@ DEFAULTS = {
     "init": None,
     "minutes": 90,
     "steps": None,
+    "gsd": None,
     "seed": 0,
     "tiles": 4000,
     "cities": [],
@@ -81,7 +82,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
 
     options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
     options += [f"--family={train['family']}"]
-    options += [f"--{key}={train[key]}" for key in ("data", "steps") if train[key] is not None]
+    options += [f"--{key}={train[key]}" for key in ("data", "steps", "gsd") if train[key] is not None]
     for key in ("cities", "leave_out"):
         if train[key]:
             options += [f"--{key.replace('_', '-')}", *map(str, train[key])]
@@ -101,12 +102,13 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     return Recipe(str(train["name"]), network_of, own, training)
 
 
-def own_options(given: dict[str, Any], split: str, seed: int) -> list[str]:
-    """The options of `learn.own` for one data set."""
+def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:
+    """The options of `learn.own` for one data set, its tiles at `gsd` (None: as usual)."""
     listed = {k: ",".join(map(str, v)) if isinstance(v, list) else v for k, v in given.items()}
     if "buildings" in listed:
         listed = {k: v for k, v in listed.items() if not k.startswith("truth")}
-    return [f"--{k.replace('_', '-')}={v}" for k, v in listed.items()] + [f"--split={split}", f"--seed={seed}"]
+    options = [f"--{k.replace('_', '-')}={v}" for k, v in listed.items()] + [f"--split={split}", f"--seed={seed}"]
+    return options + ([f"--gsd={gsd}"] if gsd else [])
 
 
 def weights(init: str, network: str, base: Path) -> Path:

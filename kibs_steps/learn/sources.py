@@ -45,7 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
     parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
     parser.add_argument("--own", nargs="*", default=[], help="folders of own samples (learn.own)")
-    parser.add_argument("--pool", help="folder of simulated tiles, shared between runs (default: OUT/../pool)")
+    parser.add_argument("--gsd", type=float, default=dataset.GSD, help="of the model to train, m per px")
+    parser.add_argument(
+        "--pool",
+        help="folder of simulated tiles of one GSD, shared between runs (default: pool or pool-GSD beside OUT)",
+    )
     parser.add_argument("--tiles", type=int, default=4000, help="simulated tiles to render into the pool (0: none)")
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that simulated tiles show parts of")
     parser.add_argument("--shares", type=shares, default={}, help="as in simulated=0.5,pasted=0.2,chips=0.1,own=0.2")
@@ -69,7 +73,8 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     `upright`: tiles as dense networks see them; else turned at random. `heights_needed`: leave out what has no heights. Raises
     `NoTrainingData`.
     """
-    pool = Path(args.pool) if args.pool else Path(args.out).parent / "pool"
+    named = "pool" if args.gsd == dataset.GSD else f"pool-{args.gsd:g}"
+    pool = Path(args.pool) if args.pool else Path(args.out).parent / named
     graphs, chips = [], []
     if args.data:
         data = Path(args.data)
@@ -87,18 +92,20 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if args.tiles:
         cities = tuple(map(citymodel.read, args.cities))
         houses = draped.houses(training, draped.read_heights(roof_graphs)) if training else []
-        look = (args.tiles, args.seed, chips, view, sun, cities, houses)
+        look = (args.tiles, args.seed, chips, view, sun, cities, houses, args.gsd)
         multiprocessing.get_context("fork").Process(target=fill_pool, args=(pool, *look), daemon=True).start()
     wanted = {**SHARES, **args.shares}
     if heights_needed:
         wanted |= {"pasted": 0.0, "chips": 0.0}
-    mixture = dataset.Mixture(pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright)
+    mixture = dataset.Mixture(
+        pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright, args.gsd
+    )
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
     kept = [path for folder in args.own for path in sorted(Path(folder, "validation").glob("[!.]*.npz"))]
     validation = [dataset.load(path) for path in kept]
     validation += [
-        dataset.simulated(np.random.default_rng([args.seed, HELD_OUT + i]), view=view, sun=sun)
+        dataset.simulated(np.random.default_rng([args.seed, HELD_OUT + i]), view=view, sun=sun, gsd=args.gsd)
         for i in range(args.validation)
     ]
     validation = [prepared(sample, size, upright) for sample in validation]
@@ -171,6 +178,7 @@ def fill_pool(
     sun: tuple[float, float] | None = None,
     cities: Sequence[citymodel.CityModel] = (),
     houses: Sequence[draped.House] = (),
+    gsd: float = dataset.GSD,
 ) -> None:
     """Render simulated tiles into a folder until it holds `count`, leaving what is there."""
     os.nice(10)
@@ -181,7 +189,9 @@ def fill_pool(
         path = pool / f"{seed}-{number:06d}.npz"
         if not path.exists():
             rng = np.random.default_rng([seed, number])
-            sample = dataset.simulated(rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities, houses=houses)
+            sample = dataset.simulated(
+                rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities, houses=houses, gsd=gsd
+            )
             dataset.save(path, sample)
 
 

@@ -36,22 +36,24 @@ from kibs_steps.learn.losses import CENTRES, Batch, losses
 from kibs_steps.models.contract import ContractMismatch
 
 DISTANCE_CLIP = 5.0  # px
+SIZE = 192  # px, side of a dense network's training tiles
 BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
 BLENDED = {"sections": 0.0, "both": 0.4, "corners": 1.0}  # share of tiles that are shown blended
-ZOOM = {"sections": 1.5, "both": 1.0, "corners": 1.0}  # `Dense.zoom`
+SECTIONS_SEEN = 0.25  # m per px at which a network for sections alone sees the image
 
 
 class Settings(NamedTuple):
     """What a run is: stored with its checkpoint."""
 
     seed: int
-    size: int = 192
+    size: int = SIZE
     batch: int = 8
     rate: float = 2e-3
     decay: float = 0.02
     family: str = "dense"
     task: str = "both"
     zoom: float = 1.0
+    gsd: float = dataset.GSD
 
 
 class Best(NamedTuple):
@@ -154,6 +156,11 @@ def dense_terms(model: Dense, batch: Batch) -> Batch:
 def network(task: str = "both", family: str = "dense", zoom: float = 1.0) -> nn.Module:
     """A new network that gives the outputs of a task; a dense one sees the image enlarged `zoom` times."""
     return maskrcnn.network(task) if family == "maskrcnn" else Dense(len(CENTRES), task, zoom)
+
+
+def usual_zoom(task: str, gsd: float) -> float:
+    """The zoom unless another is asked for: a network for sections alone sees the ground at about SECTIONS_SEEN m per px."""
+    return max(1.0, round(2 * gsd / SECTIONS_SEEN) / 2) if task == "sections" else 1.0
 
 
 def moved(batch: Any, device: torch.device) -> Any:
@@ -325,6 +332,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, help="highest learning rate")
     parser.add_argument("--batch", type=int, help="tiles per step")
+    parser.add_argument("--size", type=int, help="side of a dense network's training tiles, px")
     parser.add_argument("--zoom", type=float, help="how many times larger a dense network sees the image")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2, help="of torch, on a CPU")
@@ -340,13 +348,17 @@ def main(argv: list[str] | None = None) -> None:
     out = Path(args.out)
     if args.family == "maskrcnn":
         task = args.task or "sections"
-        settings = Settings(args.seed, maskrcnn.TILE, args.batch or 2, args.rate or 2e-4, family="maskrcnn", task=task)
+        settings = Settings(
+            args.seed, maskrcnn.TILE, args.batch or 2, args.rate or 2e-4, family="maskrcnn", task=task, gsd=args.gsd
+        )
     else:
         task = args.task or "both"
-        rate, zoom = args.rate or 2e-3, args.zoom or ZOOM[task]
+        rate, zoom = args.rate or 2e-3, args.zoom or usual_zoom(task, args.gsd)
         if zoom <= 0 or zoom % 0.5:
             parser.error(f"--zoom {zoom:g}: it goes by halves (1, 1.5, 2), so that tiles have whole cells of stride 32")
-        settings = Settings(args.seed, batch=args.batch or 8, rate=rate, task=task, zoom=zoom)
+        if (size := args.size or SIZE) * zoom % 32:
+            parser.error(f"--size {size}: times the zoom, {zoom:g}, it must be a multiple of 32")
+        settings = Settings(args.seed, size, args.batch or 8, rate, task=task, zoom=zoom, gsd=args.gsd)
     model = network(settings.task, settings.family, settings.zoom)
     if args.init:
         start_from(model, args.init)

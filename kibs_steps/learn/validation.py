@@ -28,6 +28,9 @@ from kibs_steps.models import heads, runtime, scoring
 SMALLEST = 12  # px: smaller true sections are neither asked for nor held against a model
 
 
+Decoded = tuple[Sequence[dict[str, np.ndarray]], Sequence[dataset.Sample]]  # a model's maps of the samples of a set
+
+
 class Match(NamedTuple):
     """Detections of many tiles: scores (n,), whether each matches a section not taken before; number of true sections."""
 
@@ -91,8 +94,8 @@ def roof_iou(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
     return float(both / max(either, 1))
 
 
-def village(folder: str | Path, size: int) -> list[dataset.Sample]:
-    """The real village scenes at the models' GSD, mirrored at the border to (size, size); the rim beyond is unknown.
+def village(folder: str | Path, size: int, gsd: float = dataset.GSD) -> list[dataset.Sample]:
+    """The real village scenes at `gsd`, mirrored at the border to (size, size); the rim beyond is unknown.
 
     Connected areas of one slope orientation are sections; roof without an orientation has unknown sections.
     """
@@ -102,7 +105,7 @@ def village(folder: str | Path, size: int) -> list[dataset.Sample]:
         rgb = _photograph(image)
         marked = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         orientation, roof = (marked, marked > 0) if marked.ndim == 2 else (marked[..., 1], marked[..., 2] > 0)
-        side = round(rgb.shape[0] * 0.1 / dataset.GSD)
+        side = round(rgb.shape[0] * 0.1 / gsd)
         small = cv2.resize(rgb, (side, side), interpolation=cv2.INTER_AREA)
         slope = cv2.resize(orientation, (side, side), interpolation=cv2.INTER_NEAREST)
         roof = cv2.resize(roof.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST)
@@ -133,22 +136,32 @@ def _photograph(path: Path) -> np.ndarray:
             return np.ascontiguousarray(file.read([1, 2, 3]).transpose(1, 2, 0))
 
 
-def simulated(count: int, size: int, view_elevation: tuple[float, float]) -> list[dataset.Sample]:
+def simulated(
+    count: int, size: int, view_elevation: tuple[float, float], gsd: float = dataset.GSD
+) -> list[dataset.Sample]:
     """Simulated scenes of seeds no training uses, seen from the elevations (deg) given."""
     return [
-        dataset.simulated(np.random.default_rng([424242, i]), size, view_elevation=view_elevation) for i in range(count)
+        dataset.simulated(np.random.default_rng([424242, i]), size, view_elevation=view_elevation, gsd=gsd)
+        for i in range(count)
     ]
 
 
-def photographed(data: Path, source: Path, count: int, size: int) -> list[dataset.Sample]:
-    """Held-out roof photographs pasted into chips; unlike in training, the radiometry is left as it is."""
+def photographed(data: Path, source: Path, count: int, size: int, gsd: float = dataset.GSD) -> list[dataset.Sample]:
+    """Held-out roof photographs pasted into chips; unlike in training, the radiometry is left as it is.
+
+    They alone are judged, with the sure ground about them: what a chip shows is context, its mask too coarse to judge rims by.
+    """
     graphs = [graph for graph in photographs.read_roof_graphs(source) if photographs.held_out(graph)]
     chips = photographs.read_chips(data / "chips")
     samples = []
     for i in range(count):
         rng = np.random.default_rng([434343, i])
-        ground = dataset.chip_sample(chips[rng.integers(len(chips))], rng, size)
-        samples.append(dataset.pasted_houses(ground, graphs, rng))
+        ground = dataset.chip_sample(chips[rng.integers(len(chips))], rng, size, gsd)
+        nothing = np.zeros_like(ground.roof)
+        ground = ground._replace(
+            labels=nothing.astype(np.int32) - 1, roof=nothing + dataset.UNKNOWN, corners_known=nothing
+        )
+        samples.append(dataset.pasted_houses(ground, graphs, rng, gsd=gsd))
     return samples
 
 
@@ -175,38 +188,37 @@ def judge_sections(
     }
 
 
-def best_thresholds(
-    raw: Sequence[dict[str, np.ndarray]], samples: Sequence[dataset.Sample], contract: dict[str, Any]
-) -> dict[str, float]:
-    """The pair of `roof` and `prominence` thresholds with the best sum of roof IoU and AP at overlap 0.5, by trying a grid."""
+def best_decoding(sets: Sequence[Decoded], contract: dict[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
+    """Thresholds `roof` and `prominence`, and weights of the sections' score (`learn.calibration`), by trying a grid.
 
-    def score(roof: float, prominence: float) -> float:
-        tried = {**contract, "thresholds": {**contract["thresholds"], "roof": roof, "prominence": prominence}}
-        found = [heads.decode_sections(maps, tried) for maps in raw]
-        overlap = roof_iou((m["roof"][0] > roof, s.roof) for m, s in zip(raw, samples, strict=True))
-        return overlap + average_precision(
-            matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True)
-        )
+    Every pair is judged with the weights that fit it, by the sum of roof IoU and AP at overlap 0.5, the mean over the sets of
+    (maps, samples): a small set counts as much as a large one. Sections mostly on unknown ground say nothing of the weights.
+    """
+    shown = [(number, *pair) for number, one in enumerate(sets) for pair in zip(*one, strict=True)]
+
+    def judged(roof: float, prominence: float) -> tuple[float, dict[str, float]]:
+        thresholds = {**contract["thresholds"], "roof": roof, "prominence": prominence}
+        labels, evidence, hits = [], [], []
+        for _, maps, sample in shown:
+            found = heads.decode_sections(maps, {**contract, "thresholds": thresholds}).labels
+            labels.append(found)
+            evidence.append(
+                scoring.evidence(found, rims(found), *(maps[name][0] for name in ("roof", "edge", "distance")))
+            )
+            known = heads.mean_by_label(sample.labels >= 0, found) > 0.5
+            hits.append((known, calibration.right(found, sample.labels)))
+        traits = [scoring.traits(proof[known]) for proof, (known, _) in zip(evidence, hits, strict=True)]
+        weights = calibration.weights(traits, [right[known] for known, right in hits])
+        results: list[list[Match]] = [[] for _ in sets]
+        for (number, _, sample), found, proof in zip(shown, labels, evidence, strict=True):
+            results[number].append(matches(found, scoring.scores(proof, weights), sample.labels))
+        overlaps = [roof_iou((m["roof"][0] > roof, s.roof) for m, s in zip(*one, strict=True)) for one in sets]
+        return sum(overlaps) + sum(map(average_precision, results)), weights
 
     grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)]
-    roof, prominence = max(grid, key=lambda pair: score(*pair))
-    return {"roof": roof, "prominence": prominence}
-
-
-def score_weights(
-    raw: Sequence[dict[str, np.ndarray]], samples: Sequence[dataset.Sample], contract: dict[str, Any]
-) -> dict[str, float]:
-    """Weights of the sections' score (`learn.calibration`) on the samples; sections mostly on unknown ground say nothing."""
-    found_traits, hits = [], []
-    for maps, sample in zip(raw, samples, strict=True):
-        labels = heads.decode_sections(maps, contract).labels
-        if labels.any():
-            known = heads.mean_by_label(sample.labels >= 0, labels) > 0.5
-            shown = (maps["roof"][0], maps["edge"][0], maps["distance"][0])
-            found = scoring.traits(scoring.evidence(labels, rims(labels), *shown))
-            found_traits.append({name: value[known] for name, value in found.items()})
-            hits.append(calibration.right(labels, sample.labels)[known])
-    return calibration.weights(found_traits, hits)
+    tried = {pair: judged(*pair) for pair in grid}
+    roof, prominence = max(grid, key=lambda pair: tried[pair][0])
+    return {"roof": roof, "prominence": prominence}, tried[roof, prominence][1]
 
 
 def judge_corners(
@@ -277,24 +289,22 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     model = contracts.load(args.sections, "sections")
     corner_model = contracts.load(args.corners, "corners") if args.corners else None
-    data, size = Path(args.data), model.contract["tile"]
+    data, size, gsd = Path(args.data), model.contract["tile"], model.contract["gsd"]
     sets = {
-        "village": village(data / "village", size),
+        "village": village(data / "village", size, gsd),
         "photographed": photographed(
-            data, Path(args.roofgraph or data / "roofgraph" / "roofgraph.tar"), args.count, size
+            data, Path(args.roofgraph or data / "roofgraph" / "roofgraph.tar"), args.count, size, gsd
         ),
-        "simulated": simulated(args.count, size, (50.0, 90.0)),
-        "simulated_oblique": simulated(args.count, size, (args.elevation, args.elevation)),
+        "simulated": simulated(args.count, size, (50.0, 90.0), gsd),
+        "simulated_oblique": simulated(args.count, size, (args.elevation, args.elevation), gsd),
     }
     raw_maps = {name: raw_sections(model, samples) for name, samples in sets.items()}
     report: dict[str, Any] = {}
     if args.choose:
-        chosen = ("village", "simulated", "simulated_oblique")
-        maps = [maps for name in chosen for maps in raw_maps[name]]
-        samples = [sample for name in chosen for sample in sets[name]]
-        report["thresholds"] = best_thresholds(maps, samples, model.contract)
+        chosen = [(raw_maps[name], sets[name]) for name in ("village", "simulated", "simulated_oblique")]
+        report["thresholds"], report["score"] = best_decoding(chosen, model.contract)
         model.contract["thresholds"].update(report["thresholds"])
-        report["score"] = model.contract["score"] = score_weights(maps, samples, model.contract)
+        model.contract["score"] = report["score"]
         print(report["thresholds"], report["score"])
     for name, samples in sets.items():
         raw = raw_maps[name]

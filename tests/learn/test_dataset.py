@@ -120,8 +120,20 @@ def test_chip_samples_know_roofs_and_not_sections():
     chip = photographs.Chip("x", np.where(building[..., None], 200, 20).astype(np.uint8).repeat(3, 2), building, 0.3)
     sample = dataset.chip_sample(chip, np.random.default_rng(0), 96)
     assert set(np.unique(sample.labels)) == {-1, 0}
+    known = sample.roof != dataset.UNKNOWN
     agree = (sample.rgb[..., 0] > 110) == (sample.roof == 1)
-    assert agree.mean() > 0.99
+    assert agree[known].all()
+    assert (sample.labels[~known] == -1).all()
+    assert 0.02 < (~known).mean() < 0.2
+
+
+def test_a_finer_gsd_shows_a_house_larger():
+    building = np.zeros((200, 200), bool)
+    building[80:120, 80:120] = True
+    chip = photographs.Chip("x", np.where(building[..., None], 200, 20).astype(np.uint8).repeat(3, 2), building, 0.3)
+    coarse, fine = (dataset.chip_sample(chip, np.random.default_rng(5), 256, gsd) for gsd in (0.4, 0.2))
+    bright = [(sample.rgb[..., 0] > 110).sum() for sample in (coarse, fine)]
+    assert bright[1] / bright[0] == pytest.approx(4, rel=0.1)
 
 
 def test_radiometry_keeps_shape_and_is_the_same_for_a_seed():

@@ -40,6 +40,13 @@ def test_onnx_equals_torch(task, zoom, tmp_path):
         heads.decode_corners(outputs, contract)
 
 
+@pytest.mark.parametrize(("gsd", "tile", "margin"), [(0.38, 512, 32), (0.25, 768, 48), (0.5, 384, 32)])
+def test_tiles_of_any_gsd_show_as_much_ground(gsd, tile, margin):
+    contract = export.contract_of("sections", gsd=gsd)
+    assert (contract["gsd"], contract["tile"], contract["margin"]) == (gsd, tile, margin)
+    assert contract["tile"] * training.usual_zoom("sections", gsd) % 32 == 0
+
+
 def test_weights_too_large_for_half_precision_are_kept():
     average = {"small": torch.tensor([0.5, 3.0]), "wide": torch.tensor([1.0, 80_000.0]), "steps": torch.tensor(7)}
     kept = export.halved(average)

@@ -24,6 +24,13 @@ def test_the_papers_pair_is_two_networks_and_ours_may_be(tmp_path, settings):
     assert "--task=corners" in found.training["corners"]
 
 
+def test_another_gsd_is_that_of_the_network_and_of_own_tiles(tmp_path):
+    found = recipe.recipe({"scenes": {"town": TOWN}, "train": {"own": ["town"], "gsd": 0.25}}, tmp_path)
+    assert "--gsd=0.25" in found.training["both"]
+    assert "--gsd=0.25" in recipe.own_options(found.own["town"], "blocks", 0, 0.25)
+    assert not [o for o in recipe.own_options(found.own["town"], "blocks", 0) if "gsd" in o]
+
+
 def test_own_data_of_a_scene_and_of_its_own(tmp_path):
     outlines = {"name": "roofs", "raster": "r.tif", "dtm": "d.tif", "buildings": "b.gpkg", "bands": [5, 3, 2]}
     config = {

@@ -111,6 +111,19 @@ def test_a_zoom_that_cuts_cells_is_refused(zoom, tmp_path, capsys):
     assert "it goes by halves" in capsys.readouterr().err
 
 
+def test_a_tile_that_is_no_whole_number_of_cells_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        training.main([f"--out={tmp_path}", "--task=corners", "--size=200", "--tiles=0"])
+    assert "multiple of 32" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("task", "gsd", "zoom"), [("sections", 0.38, 1.5), ("sections", 0.25, 1), ("corners", 0.38, 1)]
+)
+def test_a_network_for_sections_sees_the_ground_at_a_quarter_metre(task, gsd, zoom):
+    assert training.usual_zoom(task, gsd) == zoom
+
+
 def test_weights_that_are_no_numbers_are_refused(tmp_path):
     model = training.network()
     average = model.state_dict()

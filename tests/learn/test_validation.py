@@ -3,10 +3,12 @@
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from kibs_steps.learn import validation
+from kibs_steps.learn import dataset, validation
+from kibs_steps.models import heads
 
 
 @pytest.fixture
@@ -55,3 +57,29 @@ def test_village_scenes_are_judged_only_where_they_are_annotated():
         assert judged.sum() == round(51.2 / 0.38) ** 2
         assert (scene.labels[~judged] == -1).all()
         assert ((scene.labels != 0) == (scene.roof == 1))[judged].all()
+
+
+def shown(labels: np.ndarray, rim: float) -> dict[str, np.ndarray]:
+    """A model's maps of sections it sees whole, with edges of height `rim` between them."""
+    between = cv2.morphologyEx(labels.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0
+    inside = (~between & (labels > 0)).astype(np.uint8)
+    distance = np.minimum(cv2.distanceTransform(inside, cv2.DIST_L2, 3) / 5, 1)
+    maps = {"roof": (labels > 0) * 0.9, "edge": between * rim, "distance": distance}
+    return {name: value[None].astype(np.float32) for name, value in maps.items()}
+
+
+def test_the_best_decoding_keeps_apart_what_is_apart():
+    labels = np.zeros((64, 64), np.int32)
+    labels[8:30, 8:30], labels[8:30, 30:52], labels[36:60, 8:52] = 1, 2, 3
+    sample = dataset.empty(np.zeros((64, 64, 3), np.uint8))
+    sample = sample._replace(labels=labels, roof=(labels > 0).astype(np.uint8))
+    contract = {"head": "dense", "thresholds": {"roof": 0.95, "prominence": 0.9, "min_area": 12}}
+    sets = [([shown(labels, 0.6)], [sample]), ([shown(labels, 0.8)], [sample])]
+    thresholds, weights = validation.best_decoding(sets, contract)
+    assert thresholds["roof"] < 0.9
+    found = heads.decode_sections(
+        sets[0][0][0], {**contract, "thresholds": {**thresholds, "min_area": 12}, "score": weights}
+    )
+    match = validation.matches(found.labels, found.scores, labels)
+    assert match.hits.all()
+    assert match.truths == len(match.hits) == 3

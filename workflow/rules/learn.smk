@@ -23,7 +23,7 @@ rule own_samples:
         LEARN
     params:
         options=lambda w: recipes.own_options(
-            RECIPE.own[w.own], TRAIN["split"], TRAIN["seed"]
+            RECIPE.own[w.own], TRAIN["split"], TRAIN["seed"], TRAIN["gsd"]
         ),
     shell:
         "python -m kibs_steps.learn.own {params.options:q} --out $(dirname {output:q}) > {log:q} 2>&1"
