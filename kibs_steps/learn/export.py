@@ -26,6 +26,7 @@ THRESHOLDS = {
     "corners": {"corner": 0.3, "corner_radius": 7.5},
 }
 THRESHOLDS["both"] = THRESHOLDS["sections"] | THRESHOLDS["corners"]
+BY_SIZE = {"min_area": 2, "corner_radius": 1}  # thresholds in px² and px, for dataset.GSD
 LICENCE = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
 
 
@@ -33,6 +34,15 @@ def tiling(gsd: float) -> tuple[int, int]:
     """Tile and margin (px) that show about as much ground at any GSD; whole cells of stride 32 at half zooms too."""
     share = dataset.GSD / gsd
     return 64 * max(1, round(TILE * share / 64)), 16 * max(1, round(MARGIN * share / 16))
+
+
+def thresholds_of(task: str, gsd: float) -> dict[str, float]:
+    """THRESHOLDS of a task; what is meant in metres in px of another GSD."""
+    share = dataset.GSD / gsd
+    return {
+        name: round(value * share ** BY_SIZE[name], 1) if name in BY_SIZE else value
+        for name, value in THRESHOLDS[task].items()
+    }
 
 
 def contract_of(
@@ -59,7 +69,7 @@ def contract_of(
         "geometry_input": True,
         "upright": True,
         "flips": 8,  # where nothing leans, or nobody knows how
-        "thresholds": {**THRESHOLDS[task], **facts.get("thresholds", {})},
+        "thresholds": {**thresholds_of(task, gsd), **facts.get("thresholds", {})},
         "trained_on": {
             "view_elevation": [45, 90],
             "view_azimuth": [0, 360],

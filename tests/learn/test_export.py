@@ -44,6 +44,7 @@ def test_onnx_equals_torch(task, zoom, tmp_path):
 def test_tiles_of_any_gsd_show_as_much_ground(gsd, tile, margin):
     contract = export.contract_of("sections", gsd=gsd)
     assert (contract["gsd"], contract["tile"], contract["margin"]) == (gsd, tile, margin)
+    assert contract["thresholds"]["min_area"] * gsd**2 == pytest.approx(12 * 0.38**2, rel=0.01)
     assert contract["tile"] * training.usual_zoom("sections", gsd) % 32 == 0
 
 
