@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from kibs_steps import cli, store
-from kibs_steps.learn import dataset, losses, maskrcnn, training
+from kibs_steps.learn import dataset, examples, losses, maskrcnn, training
 from kibs_steps.learn.architectures import OUTPUTS
 from kibs_steps.models import contract as contracts
 
@@ -91,7 +91,7 @@ def contract_of(
         contract.update(maskrcnn.contract_terms(task, heights or (6.0, 4.0)))
         contract["thresholds"].update(facts.get("thresholds", {}))
     elif task == "corners":
-        contract["blend"] = training.BLEND
+        contract["blend"] = examples.BLEND
     if task != "sections" and family == "dense":
         mean, sigma = heights or (6.0, 4.0)
         contract["heights"] = {

@@ -1,7 +1,7 @@
 """Loss terms of the dense network: from its logits and a batch of targets to named numbers.
 
 A term is a mean over what is known: pixels without truth do not count. In: raw maps by name (`architectures.Dense.logits`),
-targets by name (`training.example`). Pure functions.
+targets by name (`examples.example`). Pure functions.
 """
 
 from __future__ import annotations

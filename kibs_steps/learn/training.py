@@ -24,21 +24,16 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from kibs_steps import cli, store
-from kibs_steps.blend import blend
-from kibs_steps.learn import dataset, maskrcnn, sources, targets
-from kibs_steps.learn.architectures import SURFACES, Dense, normalised
+from kibs_steps.learn import dataset, examples, maskrcnn, sources
+from kibs_steps.learn.architectures import Dense, normalised
 from kibs_steps.learn.losses import CENTRES, Batch, losses
 from kibs_steps.models.contract import ContractMismatch
 
-DISTANCE_CLIP = 5.0  # px
 SIZE = 192  # px, side of a dense network's training tiles
-BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
-BLENDED = {"sections": 0.0, "both": 0.4, "corners": 1.0}  # share of tiles that are shown blended
 SECTIONS_SEEN = 0.25  # m per px at which a network for sections alone sees the image
 
 
@@ -65,17 +60,6 @@ class Best(NamedTuple):
     average: Batch
 
 
-class Examples(Dataset):
-    """Tiles of a mixture with their targets, as arrays a DataLoader can stack."""
-
-    def __init__(self, mixture: dataset.Mixture, settings: Settings):
-        self.mixture, self.settings = mixture, settings
-
-    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
-        cv2.setNumThreads(1)
-        return example_of(self.mixture[index], np.random.default_rng([self.mixture.seed, index, 1]), self.settings)
-
-
 class Onwards(torch.utils.data.Sampler):
     """Indices from `start` without end: a resumed run sees new tiles, not its first ones again."""
 
@@ -84,61 +68,6 @@ class Onwards(torch.utils.data.Sampler):
 
     def __iter__(self):
         return iter(range(self.start, 2**31))
-
-
-def example(
-    sample: dataset.Sample, rng: np.random.Generator, blended: bool, task: str = "both"
-) -> dict[str, np.ndarray]:
-    """Image, plain or blended with sections as a model might find them, geometry and the targets of a task.
-
-    A blended image shows the sections: what it is asked for is corners and heights.
-    """
-    size = sample.labels.shape
-    found = {
-        "image": (painted(sample, rng) if blended else sample.rgb).transpose(2, 0, 1).copy(),
-        "geometry": sample.geometry,
-        "surface": targets.surface(sample.surface, SURFACES),
-    }
-    if task != "corners":
-        plain = np.float32(not blended)
-        found |= {
-            "roof": np.where(blended, np.uint8(targets.IGNORED), sample.roof),
-            "edge": targets.edge(sample.labels),
-            "distance": targets.distance(sample.labels, DISTANCE_CLIP),
-            "sections_known": plain * (sample.labels >= 0).astype(np.float32) * targets.section_weight(sample.labels),
-        }
-    if task != "sections":
-        found |= {
-            "heat": targets.corner_heat(sample.corners, size),
-            "offset": targets.corner_offset(sample.corners, size),
-            "corners_known": sample.corners_known,
-            "slope": targets.slope(sample.labels, sample.height),
-            "corner_height": targets.corner_height(sample.corners, sample.corner_heights, size),
-            "roof_height": targets.roof_height(sample.height),
-        }
-    return found
-
-
-def example_of(sample: dataset.Sample, rng: np.random.Generator, settings: Settings) -> dict[str, np.ndarray]:
-    """The example of a sample that a run's family and task learn from."""
-    if settings.family == "maskrcnn":
-        return maskrcnn.example(sample, settings.task, supposed(sample, rng))
-    return example(sample, rng, bool(rng.random() < BLENDED[settings.task]), settings.task)
-
-
-def painted(sample: dataset.Sample, rng: np.random.Generator) -> np.ndarray:
-    """The image (s, s, 3) uint8 blended with sections as a model might find them."""
-    return blend(sample.rgb, supposed(sample, rng), **BLEND)
-
-
-def supposed(sample: dataset.Sample, rng: np.random.Generator) -> np.ndarray:
-    """Section labels (s, s) as a model might find them: mostly wrong in the ways models are wrong."""
-    labels = np.maximum(sample.labels, 0)
-    areas = ndimage.label((sample.labels < 0) & (sample.roof == 1))[0]
-    labels = np.where(areas > 0, areas + labels.max(), labels).astype(np.int32)
-    if rng.random() < 0.85:
-        labels = targets.perturbed(labels, rng)
-    return labels
 
 
 def dense_terms(model: Dense, batch: Batch) -> Batch:
@@ -367,7 +296,7 @@ def main(argv: list[str] | None = None) -> None:
     dense = args.family == "dense"
     found = sources.gather(args, settings.size, dense, settings.task == "corners" and not dense)
     kept = [
-        example_of(sample, np.random.default_rng([args.seed, i, 2]), settings)
+        examples.example_of(sample, np.random.default_rng([args.seed, i, 2]), settings.family, settings.task)
         for i, sample in enumerate(found.validation)
     ]
     found.about["init"] = (
@@ -375,7 +304,7 @@ def main(argv: list[str] | None = None) -> None:
     )
     steps = train(
         model,
-        Examples(found.mixture, settings),
+        examples.Examples(found.mixture, settings.family, settings.task),
         settings,
         out,
         args.minutes * 60,

@@ -5,7 +5,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs the extra `learn` (torch)")
 
-from kibs_steps.learn import dataset, training  # noqa: E402
+from kibs_steps.learn import dataset, examples, training  # noqa: E402
 from kibs_steps.learn.architectures import CHANNELS, Dense  # noqa: E402
 from kibs_steps.models.contract import ContractMismatch  # noqa: E402
 
@@ -27,7 +27,7 @@ class Tiles(torch.utils.data.Dataset):
 
     def __getitem__(self, index):
         self.seen.append(index)
-        return training.example(self.sample, np.random.default_rng(index), blended=bool(index % 2))
+        return examples.example(self.sample, np.random.default_rng(index), blended=bool(index % 2))
 
 
 SETTINGS = training.Settings(0, size=64, batch=2)
@@ -75,7 +75,7 @@ def test_unknown_ground_gives_no_gradient():
     sample.surface[:, :32] = 0
     raw = logits()
     sum(
-        training.losses(raw, batch_of(training.example(sample, np.random.default_rng(0), False)), "both").values()
+        training.losses(raw, batch_of(examples.example(sample, np.random.default_rng(0), False)), "both").values()
     ).backward()
     for name, value in raw.items():
         half = value.shape[-1] // 2
@@ -87,7 +87,7 @@ def test_blended_tiles_teach_corners_and_heights_only():
     raw = logits()
     sum(
         training.losses(
-            raw, batch_of(training.example(Tiles().sample, np.random.default_rng(0), True)), "both"
+            raw, batch_of(examples.example(Tiles().sample, np.random.default_rng(0), True)), "both"
         ).values()
     ).backward()
     for name in ("roof", "edge", "distance"):
@@ -149,7 +149,7 @@ def test_a_run_ends_when_the_validation_loss_has_stopped_falling(tmp_path, monke
     told = iter([3.0, 2.0, 2.5, 2.5])
     monkeypatch.setattr(training, "validated", lambda *arguments: next(told))
     tiles = Tiles()
-    kept = [training.example(tiles.sample, np.random.default_rng(0), False)]
+    kept = [examples.example(tiles.sample, np.random.default_rng(0), False)]
     options = {"workers": 0, "validation": kept, "patience": 2, "look_every": 1}
     assert training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=9, **options) == 4
     state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
@@ -161,7 +161,7 @@ def test_a_run_ends_when_the_validation_loss_has_stopped_falling(tmp_path, monke
 
 def test_looking_at_validation_tiles_leaves_the_network_as_it_was():
     model = training.network().train()
-    batch = torch.utils.data.default_collate([training.example(Tiles().sample, np.random.default_rng(0), False)] * 2)
+    batch = torch.utils.data.default_collate([examples.example(Tiles().sample, np.random.default_rng(0), False)] * 2)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     modes = [part.training for part in model.modules()]
     average = {name: value.clone() for name, value in before.items()}
