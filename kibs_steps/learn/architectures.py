@@ -312,7 +312,8 @@ class Dense(nn.Module):
 
 def resized(maps: torch.Tensor, factor: float) -> torch.Tensor:
     """Maps (n, c, h, w) with sides `factor` times as long, bilinear; the maps' own edges stay where they are."""
-    return F.interpolate(maps, scale_factor=factor, mode="bilinear", align_corners=False)
+    size = [round(int(side) * factor) for side in maps.shape[2:]]
+    return F.interpolate(maps, size=size, mode="bilinear", align_corners=False)
 
 
 def normalised(rgb: torch.Tensor) -> torch.Tensor:

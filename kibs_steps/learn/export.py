@@ -36,6 +36,14 @@ def tiling(gsd: float) -> tuple[int, int]:
     return 64 * max(1, round(TILE * share / 64)), 16 * max(1, round(MARGIN * share / 16))
 
 
+def zoom_at(gsd: float, settings: training.Settings) -> float:
+    """The zoom with which a network sees the ground at `gsd` as large as in training, so that a tile is whole cells of stride 32."""
+    if gsd == settings.gsd:
+        return settings.zoom
+    tile = tiling(gsd)[0]
+    return 32 * round(settings.zoom * gsd / settings.gsd * tile / 32) / tile
+
+
 def thresholds_of(task: str, gsd: float) -> dict[str, float]:
     """THRESHOLDS of a task; what is meant in metres in px of another GSD."""
     share = dataset.GSD / gsd
@@ -155,6 +163,11 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--checkpoint", required=True)
     parser.add_argument("--task", choices=list(OUTPUTS), required=True)
     parser.add_argument("--out", required=True, help="ONNX file")
+    parser.add_argument(
+        "--gsd",
+        type=float,
+        help="of the model, m per px, if not that of the run: it sees the ground as large as in training",
+    )
     parser.add_argument("--weights", help="also write the weights here, for other runs to start from (training --init)")
     parser.add_argument("--pool", help="simulated tiles, for the mean corner height")
     parser.add_argument("--thresholds", type=json.loads, default={}, help="JSON, replaces thresholds of the contract")
@@ -164,7 +177,10 @@ def main(argv: list[str] | None = None) -> None:
     state = torch.load(args.checkpoint, weights_only=True, map_location="cpu")
     task, settings = args.task, training.Settings(**state["settings"])
     average = state.get("best", {}).get("average") or state["average"]
-    model = training.network(task, settings.family, settings.zoom)
+    gsd = args.gsd or settings.gsd
+    if gsd != settings.gsd and (task, settings.family) != ("sections", "dense"):
+        parser.error(f"--gsd {gsd:g}: only a dense network for sections alone can be made into a model for another GSD")
+    model = training.network(task, settings.family, zoom_at(gsd, settings))
     model.load_state_dict(average)
     about = {**state.get("about", {}), "tiles_seen": state["step"] * settings.batch}
     about |= {"minutes": round(state["seconds"] / 60, 1), "converged": state.get("converged")}
@@ -182,7 +198,7 @@ def main(argv: list[str] | None = None) -> None:
         facts["metrics"] = report
     if heights is None and args.pool and task != "sections":
         heights = corner_height_moments(Path(args.pool))
-    export(model, args.out, contract_of(task, heights, settings.family, settings.gsd, **facts))
+    export(model, args.out, contract_of(task, heights, settings.family, gsd, **facts))
     if args.weights:
         with store.whole(args.weights, summed=False) as temporary:
             torch.save({"average": halved(average), "settings": state["settings"]}, temporary)

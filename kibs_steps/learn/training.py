@@ -285,6 +285,8 @@ def main(argv: list[str] | None = None) -> None:
         rate, zoom = args.rate or 2e-3, args.zoom or usual_zoom(task, args.gsd)
         if zoom <= 0 or zoom % 0.5:
             parser.error(f"--zoom {zoom:g}: it goes by halves (1, 1.5, 2), so that tiles have whole cells of stride 32")
+        if zoom != 1 and task != "sections":
+            parser.error("--zoom is for a network for sections alone (--task sections): offsets and slopes are in px")
         if (size := args.size or SIZE) * zoom % 32:
             parser.error(f"--size {size}: times the zoom, {zoom:g}, it must be a multiple of 32")
         settings = Settings(args.seed, size, args.batch or 8, rate, task=task, zoom=zoom, gsd=args.gsd)

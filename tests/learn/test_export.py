@@ -48,6 +48,25 @@ def test_tiles_of_any_gsd_show_as_much_ground(gsd, tile, margin):
     assert contract["tile"] * training.usual_zoom("sections", gsd) % 32 == 0
 
 
+@pytest.mark.parametrize(("gsd", "zoom"), [(0.38, 1.5), (0.25, 1.0), (0.5, 2.0)])
+def test_a_network_sees_the_ground_at_another_gsd_as_large_as_in_training(gsd, zoom):
+    settings = training.Settings(0, task="sections", zoom=1.5)
+    assert export.zoom_at(gsd, settings) == zoom
+
+
+def test_one_run_makes_models_for_two_gsds(tmp_path):
+    settings = training.Settings(0, task="sections", zoom=1.5)
+    average = training.network("sections", zoom=1.5).state_dict()
+    state = {"average": average, "settings": settings._asdict(), "step": 3, "seconds": 9.0}
+    torch.save(state, tmp_path / "checkpoint.pt")
+    options = [f"--checkpoint={tmp_path}/checkpoint.pt", "--task=sections", "--gsd=0.25"]
+    export.main([*options, f"--out={tmp_path}/sections.onnx"])
+    contract = contracts.load(tmp_path / "sections.onnx", "sections").contract
+    assert (contract["gsd"], contract["tile"], contract["margin"]) == (0.25, 768, 48)
+    with pytest.raises(SystemExit):
+        export.main([*options, "--task=corners", f"--out={tmp_path}/corners.onnx"])
+
+
 def test_weights_too_large_for_half_precision_are_kept():
     average = {"small": torch.tensor([0.5, 3.0]), "wide": torch.tensor([1.0, 80_000.0]), "steps": torch.tensor(7)}
     kept = export.halved(average)
