@@ -37,7 +37,7 @@ def tiling(gsd: float) -> tuple[int, int]:
 
 
 def zoom_at(gsd: float, settings: training.Settings) -> float:
-    """The zoom with which a network sees the ground at `gsd` as large as in training, so that a tile is whole cells of stride 32."""
+    """The zoom with which a network sees the ground at `gsd` as large as in training; a tile stays whole cells of stride 32."""
     if gsd == settings.gsd:
         return settings.zoom
     tile = tiling(gsd)[0]
