@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 GSD = 0.38  # m per px of the models trained here, if no other is asked for
 AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their source
 UNKNOWN = 255
+FORGOTTEN = 0.15  # share of training tiles whose view a network is not told; and whose sun
 LOOSE = 5  # px, width of the strip about a mask's outline of which nothing is asked
 NADIR = np.array([0, 0, 0, 0, 1, 0], np.float32)
 
@@ -294,7 +295,7 @@ def window(sample: Sample, row: int, col: int, size: int) -> Sample:
     )
 
 
-def without_geometry(sample: Sample, rng: np.random.Generator, share: float = 0.15) -> Sample:
+def without_geometry(sample: Sample, rng: np.random.Generator, share: float = FORGOTTEN) -> Sample:
     """Forgets now the view, now the sun, so that a network learns to do without."""
     geometry = sample.geometry.copy()
     for vector, flag in ((slice(0, 2), 4), (slice(2, 4), 5)):
@@ -362,7 +363,8 @@ class Mixture:
 
     `shares` are the probabilities of (simulated, pasted houses, chips, own). Simulated tiles come from `pool`, a folder of
     kept samples that another process may still be filling; while it is empty, the other sources stand in. `own` are files of
-    kept samples (`learn.own`), as those at `gsd`. Tiles come `upright`, or turned at random.
+    kept samples (`learn.own`), as those at `gsd`. The share `forget` comes without view, and without sun. Tiles come `upright`,
+    or turned at random.
     """
 
     def __init__(
@@ -376,8 +378,9 @@ class Mixture:
         own: Sequence[Path] = (),
         upright: bool = True,
         gsd: float = GSD,
+        forget: float = FORGOTTEN,
     ):
-        self.own, self.upright, self.gsd = list(own), upright, gsd
+        self.own, self.upright, self.gsd, self.forget = list(own), upright, gsd, forget
         self.pool, self.graphs, self.chips = pool, graphs, chips
         self.shares, self.size, self.seed = shares, size, seed
         self._kept: list[Path] = []
@@ -406,6 +409,6 @@ class Mixture:
                 sample = with_decoys(sample, other, rng)
             if source == 1:
                 sample = pasted_houses(sample, self.graphs, rng, gsd=self.gsd)
-        sample = without_geometry(sample, rng)
+        sample = without_geometry(sample, rng, self.forget)
         sample = upright(sample, rng) if self.upright else dihedral(sample, int(rng.integers(8)))
         return sample if rng.random() < AS_IT_IS else sample._replace(rgb=radiometry(sample.rgb, rng))

@@ -53,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tiles", type=int, default=4000, help="simulated tiles to render into the pool (0: none)")
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that simulated tiles show parts of")
     parser.add_argument("--shares", type=shares, default={}, help="as in simulated=0.5,pasted=0.2,chips=0.1,own=0.2")
+    parser.add_argument(
+        "--forget", type=float, default=dataset.FORGOTTEN, help="share of tiles whose view, and whose sun, is not told"
+    )
     parser.add_argument("--validation", type=int, default=0, help="simulated validation tiles, besides the own ones")
     for name in ("view", "sun"):
         parser.add_argument(f"--{name}-azimuth", type=float, help="simulate for one scene: its angle, deg")
@@ -98,7 +101,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if heights_needed:
         wanted |= {"pasted": 0.0, "chips": 0.0}
     mixture = dataset.Mixture(
-        pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright, args.gsd
+        pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright, args.gsd, args.forget
     )
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
