@@ -171,6 +171,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--weights", help="also write the weights here, for other runs to start from (training --init)")
     parser.add_argument("--pool", help="simulated tiles, for the mean corner height")
     parser.add_argument("--thresholds", type=json.loads, default={}, help="JSON, replaces thresholds of the contract")
+    parser.add_argument("--like", help="model that the run started from: its thresholds and score hold on")
     parser.add_argument("--metrics", help="report of learn.validation, kept in the contract")
     parser.add_argument("--commit", help="commit of the training code")
     args = parser.parse_args(argv)
@@ -186,6 +187,11 @@ def main(argv: list[str] | None = None) -> None:
     about |= {"minutes": round(state["seconds"] / 60, 1), "converged": state.get("converged")}
     heights = about.pop("corner_heights", None)
     facts: dict[str, Any] = {"thresholds": args.thresholds, "seed": settings.seed, "about": about}
+    if args.like:
+        like = contracts.load(args.like, task).contract
+        kept = {k: v for k, v in like["thresholds"].items() if k not in BY_SIZE or like["gsd"] == gsd}
+        facts["thresholds"] = {**kept, **args.thresholds}
+        facts |= {key: like[key] for key in ("score",) if key in like}
     if args.commit:
         facts["commit"] = args.commit
     if args.metrics:

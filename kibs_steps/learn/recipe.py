@@ -41,12 +41,14 @@ SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
 
 
 class Recipe(NamedTuple):
-    """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.training` by network."""
+    """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.training` by network,
+    and of `learn.export` by task."""
 
     name: str
     network_of: dict[str, str]
     own: dict[str, dict[str, Any]]
     training: dict[str, list[str]]
+    export: dict[str, list[str]]
 
     def files(self, own: str) -> list[str]:
         """The files of one own data set that are there."""
@@ -99,7 +101,9 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
         init = [f"--init={weights(train['init'], network, base)}"] if train["init"] else []
         training[network] = [*options, f"--task={network}", *init]
     network_of = {task: network for network, tasks in exports.items() for task in tasks}
-    return Recipe(str(train["name"]), network_of, own, training)
+    like = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
+    export = {task: [f"--like={path}"] if path else [] for task, path in like.items()}
+    return Recipe(str(train["name"]), network_of, own, training, export)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:
@@ -111,12 +115,23 @@ def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None 
     return options + ([f"--gsd={gsd}"] if gsd else [])
 
 
+def set_folder(init: str, base: Path) -> Path:
+    """The folder of a model set: of that name in `models/`, or a path."""
+    folder = base / "models" / init
+    return folder if folder.is_dir() else Path(init)
+
+
+def like_model(init: str, task: str, base: Path) -> Path | None:
+    """The model of the set that a training starts from, whose thresholds hold on; None if it started from bare weights."""
+    path = set_folder(init, base) / f"{task}.onnx"
+    return path if path.is_file() else None
+
+
 def weights(init: str, network: str, base: Path) -> Path:
     """The weights to start from: a file, or of a model set its `NETWORK.pt`, `weights.pt` or only `.pt` file."""
     if Path(init).is_file():
         return Path(init)
-    folder = base / "models" / init
-    folder = folder if folder.is_dir() else Path(init)
+    folder = set_folder(init, base)
     named = [folder / f"{network}.pt", folder / "weights.pt"]
     found = [f for f in named if f.is_file()] or sorted(folder.glob("*.pt"))
     if not found or (len(found) > 1 and found[0] not in named):

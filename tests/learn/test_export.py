@@ -67,6 +67,21 @@ def test_one_run_makes_models_for_two_gsds(tmp_path):
         export.main([*options, "--task=corners", f"--out={tmp_path}/corners.onnx"])
 
 
+def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
+    weights = dict.fromkeys(("log_area", "roof", "rim", "inside", "summit", "rim_length", "bias"), 0.5)
+    like = export.contract_of("sections", thresholds={"roof": 0.66, "min_area": 20}, score=weights)
+    export.export(training.network("sections"), tmp_path / "like.onnx", like)
+    state = {"average": training.network("sections").state_dict(), "step": 1, "seconds": 1.0}
+    for gsd, min_area in ((0.38, 20), (0.5, 6.9)):
+        settings = training.Settings(0, task="sections", gsd=gsd)._asdict()
+        torch.save({**state, "settings": settings}, tmp_path / "checkpoint.pt")
+        options = [f"--checkpoint={tmp_path}/checkpoint.pt", "--task=sections", f"--out={tmp_path}/new.onnx"]
+        export.main([*options, f"--like={tmp_path}/like.onnx"])
+        contract = contracts.load(tmp_path / "new.onnx", "sections").contract
+        assert contract["thresholds"] == {"roof": 0.66, "prominence": 0.2, "min_area": min_area}
+        assert contract["score"] == weights
+
+
 def test_weights_too_large_for_half_precision_are_kept():
     average = {"small": torch.tensor([0.5, 3.0]), "wide": torch.tensor([1.0, 80_000.0]), "steps": torch.tensor(7)}
     kept = export.halved(average)

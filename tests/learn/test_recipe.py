@@ -62,6 +62,9 @@ def test_fine_tuning_takes_the_scenes_angles_and_the_sets_weights(tmp_path):
     options = recipe.recipe(config, tmp_path).training["both"]
     assert {"--view-azimuth=181.1", "--view-elevation=59.3", f"--init={folder / 'weights.pt'}"} <= set(options)
     assert "--shares=simulated=0.5,own=0.5" in options
+    assert recipe.recipe(config, tmp_path).export == {"both": [], "sections": [], "corners": []}
+    (folder / "sections.onnx").touch()
+    assert recipe.recipe(config, tmp_path).export["sections"] == [f"--like={folder / 'sections.onnx'}"]
     (folder / "both.pt").touch()
     assert recipe.weights("free", "both", tmp_path) == folder / "both.pt"
     assert recipe.weights(str(folder / "weights.pt"), "both", tmp_path) == folder / "weights.pt"

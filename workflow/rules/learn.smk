@@ -62,8 +62,10 @@ rule exported:
     retries: 0
     conda:
         LEARN
+    params:
+        options=lambda w: RECIPE.export[w.task],
     shell:
-        "python -m kibs_steps.learn.export --checkpoint $(dirname {input:q})/checkpoint.pt --task {wildcards.task}"
+        "python -m kibs_steps.learn.export {params.options:q} --checkpoint $(dirname {input:q})/checkpoint.pt --task {wildcards.task}"
         " --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
 
 
