@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from kibs_steps import cli, store
-from kibs_steps.learn import dataset, examples, losses, maskrcnn, training
+from kibs_steps.learn import dataset, examples, losses, maskrcnn, sources, training
 from kibs_steps.learn.architectures import OUTPUTS
 from kibs_steps.models import contract as contracts
 
@@ -27,7 +27,7 @@ THRESHOLDS = {
 }
 THRESHOLDS["both"] = THRESHOLDS["sections"] | THRESHOLDS["corners"]
 BY_SIZE = {"min_area": 2, "corner_radius": 1}  # thresholds in px² and px, for dataset.GSD
-LICENCE = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
+FRESH = ("none", training.IMAGENET)  # what a run starts from that adds no data of its own
 
 
 def tiling(gsd: float) -> tuple[int, int]:
@@ -88,7 +88,7 @@ def contract_of(
                 "roof-graph photographs (Ren et al. 2021), pasted",
                 "chips with building masks",
             ],
-            "licence": LICENCE,
+            "licence": sources.NON_COMMERCIAL,
         },
     }
     trained = {**contract["trained_on"], **facts.get("about", {})}
@@ -110,6 +110,21 @@ def contract_of(
         }
     contract.update({k: facts[k] for k in ("metrics", "score") if k in facts})
     return contracts.validate(contract, "the new contract")
+
+
+def inherited(about: dict[str, Any], before: dict[str, Any] | None) -> dict[str, Any]:
+    """What a contract says of a run's training, with data and licence of the weights it started from.
+
+    `before` is `trained_on` of the model those were taken from; None if no such model is known.
+    """
+    if before is None:
+        if about.get("init", "none") in FRESH or "licence" not in about:
+            return about
+        return {**about, "licence": f"{about['licence']}; and as the weights it started from ({about['init']}) allow"}
+    licences = dict.fromkeys([before["licence"], about.get("licence", before["licence"])])
+    binding = [licence for licence in licences if licence != sources.SIMULATED] or [sources.SIMULATED]
+    data = [*about.get("data", []), *(f"before that: {what}" for what in before["data"])]
+    return {**about, "data": list(dict.fromkeys(data)), "licence": "; and ".join(binding)}
 
 
 def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float] | None:
@@ -171,7 +186,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--weights", help="also write the weights here, for other runs to start from (training --init)")
     parser.add_argument("--pool", help="simulated tiles, for the mean corner height")
     parser.add_argument("--thresholds", type=json.loads, default={}, help="JSON, replaces thresholds of the contract")
-    parser.add_argument("--like", help="model that the run started from: its thresholds and score hold on")
+    parser.add_argument(
+        "--like", help="model whose weights the run started from: its thresholds, score and licence hold on"
+    )
     parser.add_argument("--metrics", help="report of learn.validation, kept in the contract")
     parser.add_argument("--commit", help="commit of the training code")
     args = parser.parse_args(argv)
@@ -187,8 +204,9 @@ def main(argv: list[str] | None = None) -> None:
     about |= {"minutes": round(state["seconds"] / 60, 1), "converged": state.get("converged")}
     heights = about.pop("corner_heights", None)
     facts: dict[str, Any] = {"thresholds": args.thresholds, "seed": settings.seed, "about": about}
-    if args.like:
-        like = contracts.load(args.like, task).contract
+    like = contracts.load(args.like, task).contract if args.like else None
+    facts["about"] = inherited(about, like and like["trained_on"])
+    if like:
         kept = {k: v for k, v in like["thresholds"].items() if k not in BY_SIZE or like["gsd"] == gsd}
         facts["thresholds"] = {**kept, **args.thresholds}
         facts |= {key: like[key] for key in ("score",) if key in like}

@@ -122,8 +122,9 @@ def set_folder(init: str, base: Path) -> Path:
 
 
 def like_model(init: str, task: str, base: Path) -> Path | None:
-    """The model of the set that a training starts from, whose thresholds hold on; None if it started from bare weights."""
-    path = set_folder(init, base) / f"{task}.onnx"
+    """The model beside the weights that a training starts from, whose thresholds and licence hold on; None if there is none."""
+    folder = Path(init).parent if Path(init).is_file() else set_folder(init, base)
+    path = folder / f"{task}.onnx"
     return path if path.is_file() else None
 
 

@@ -34,6 +34,7 @@ from kibs_steps.learn.losses import CENTRES, Batch, losses
 from kibs_steps.models.contract import ContractMismatch
 
 SIZE = 192  # px, side of a dense network's training tiles
+IMAGENET = "ImageNet (encoder)"
 SECTIONS_SEEN = 0.25  # m per px at which a network for sections alone sees the image
 
 
@@ -301,9 +302,7 @@ def main(argv: list[str] | None = None) -> None:
         examples.example_of(sample, np.random.default_rng([args.seed, i, 2]), settings.family, settings.task)
         for i, sample in enumerate(found.validation)
     ]
-    found.about["init"] = (
-        Path(args.init).name if args.init else "ImageNet (encoder)" if args.family == "dense" else "none"
-    )
+    found.about["init"] = Path(args.init).name if args.init else IMAGENET if args.family == "dense" else "none"
     steps = train(
         model,
         examples.Examples(found.mixture, settings.family, settings.task),

@@ -1,11 +1,13 @@
 """The ONNX file gives what the network gives, and carries a valid contract."""
 
+import re
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="export needs the extra `learn` (torch)")
 
-from kibs_steps.learn import export, training  # noqa: E402
+from kibs_steps.learn import export, sources, training  # noqa: E402
 from kibs_steps.learn.architectures import OUTPUTS  # noqa: E402
 from kibs_steps.models import contract as contracts  # noqa: E402
 from kibs_steps.models import heads, runtime  # noqa: E402
@@ -80,6 +82,31 @@ def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
         contract = contracts.load(tmp_path / "new.onnx", "sections").contract
         assert contract["thresholds"] == {"roof": 0.66, "prominence": 0.2, "min_area": min_area}
         assert contract["score"] == weights
+
+
+@pytest.mark.parametrize(
+    ("about", "before", "licence"),
+    [
+        (
+            {"licence": sources.OWN, "data": ["own"], "init": "sections.pt"},
+            sources.NON_COMMERCIAL,
+            "CC BY-NC .*; and as the owner",
+        ),
+        ({"licence": sources.OWN, "data": ["own"], "init": "sections.pt"}, sources.SIMULATED, "^as the owner"),
+        ({"licence": sources.SIMULATED, "data": [], "init": "a.pt"}, sources.NON_COMMERCIAL, "^CC BY-NC [^;]*$"),
+        (
+            {"licence": sources.OWN, "data": [], "init": "a.pt"},
+            None,
+            r"as the owner .*; and as the weights .*\(a.pt\) allow",
+        ),
+        ({"licence": sources.OWN, "data": [], "init": training.IMAGENET}, None, "^as the owner[^;]*$"),
+    ],
+)
+def test_the_licence_of_the_weights_a_run_started_from_is_kept(about, before, licence):
+    told = before and {"licence": before, "data": ["roofs of others"]}
+    found = export.inherited(about, told)
+    assert re.search(licence, found["licence"])
+    assert ("before that: roofs of others" in found["data"]) == (before is not None)
 
 
 def test_weights_too_large_for_half_precision_are_kept():
