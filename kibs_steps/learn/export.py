@@ -27,6 +27,7 @@ THRESHOLDS = {
 }
 THRESHOLDS["both"] = THRESHOLDS["sections"] | THRESHOLDS["corners"]
 BY_SIZE = {"min_area": 2, "corner_radius": 1}  # thresholds in px² and px, for dataset.GSD
+BEFORE = "before that: "
 FRESH = ("none", training.IMAGENET)  # what a run starts from that adds no data of its own
 
 
@@ -123,8 +124,10 @@ def inherited(about: dict[str, Any], before: dict[str, Any] | None) -> dict[str,
         return {**about, "licence": f"{about['licence']}; and as the weights it started from ({about['init']}) allow"}
     licences = dict.fromkeys([before["licence"], about.get("licence", before["licence"])])
     binding = [licence for licence in licences if licence != sources.SIMULATED] or [sources.SIMULATED]
-    data = [*about.get("data", []), *(f"before that: {what}" for what in before["data"])]
-    return {**about, "data": list(dict.fromkeys(data)), "licence": "; and ".join(binding)}
+    data = list(about.get("data", []))
+    earlier = (what.removeprefix(BEFORE) for what in before["data"])
+    data += [BEFORE + what for what in dict.fromkeys(earlier) if what not in data]
+    return {**about, "data": data, "licence": "; and ".join(binding)}
 
 
 def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float] | None:
