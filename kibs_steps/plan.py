@@ -218,10 +218,15 @@ def models_for(settings: dict[str, Any], base: Path) -> dict[str, contract.Model
 
 
 def own_gsd(raster: str | None) -> float | None:
-    """Pixel side (m) of a raster, None where there is none to read: that is refused later, with what to do."""
+    """Pixel side (m) of a file's or URL's raster, None where there is none to read: that is refused later, with what to do."""
     from kibs_steps import scene
 
-    return scene.own_gsd(raster) if raster and Path(raster).exists() else None
+    path = sources.place(raster or "")
+    if sources.is_remote(path):
+        sources.version(path)  # says better than GDAL what does not answer
+    elif not Path(path).exists():
+        return None
+    return scene.own_gsd(path)
 
 
 def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) -> list[str]:

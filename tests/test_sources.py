@@ -12,7 +12,7 @@ import rasterio
 import toy
 from affine import Affine
 
-from kibs_steps import fingerprint, imagery, scene, sources, tiled, tiles
+from kibs_steps import fingerprint, imagery, plan, scene, sources, tiled, tiles
 from kibs_steps.grid import Tiling, Window
 from kibs_steps.publish import run
 
@@ -116,6 +116,21 @@ def test_a_changed_remote_file_is_noticed(served):
     handler.tag = "two"
     assert sources.content(path, folder / "cache.json") != first
     assert run.inputs([path], folder / "cache.json") == [{"file": path, "version": ['"two"', None, "7"]}]
+
+
+def test_a_suite_chooses_by_the_pixels_of_a_url_too(served):
+    """A raster of unknown GSD would get the finest set, which refuses coarse rasters."""
+    folder, url, _ = served
+    write(folder / "a.tif", noise(64))
+    for name, gsd in (("fine", 0.25), ("usual", toy.GSD)):
+        toy.sections_model(folder / "models" / name / "sections.onnx", toy.contract("sections", gsd=gsd))
+        toy.corners_model(folder / "models" / name / "corners.onnx", toy.contract("corners", gsd=gsd))
+    settings = {"models": str(folder / "models"), "method": "two_stage"}
+    for raster in (f"{url}/a.tif", str(folder / "a.tif")):
+        found = plan.models_for({**settings, "raster": raster}, folder)
+        assert found["sections"].path.parent.name == "usual", raster
+    with pytest.raises(sources.SourceUnreachable, match=r"nothing\.tif"):
+        plan.models_for({**settings, "raster": f"{url}/nothing.tif"}, folder)
 
 
 def test_what_does_not_answer_is_told(served):

@@ -1,5 +1,7 @@
 """Which set of a suite a scene gets: angles first, then GSD, then the more special one."""
 
+from pathlib import Path
+
 import pytest
 import toy
 
@@ -33,6 +35,13 @@ def test_the_nearest_gsd_not_finer_than_the_raster(tmp_path, gsd, expected):
     for size in (0.25, 0.38, 0.50):
         add(tmp_path, f"-{size * 100:.0f}", gsd=size)
     assert chosen(tmp_path, gsd).stem == f"sections-{expected}"
+
+
+@pytest.mark.parametrize(("gsd", "expected"), [(0.1, 0.25), (0.25, 0.25), (0.3, 0.38), (0.38, 0.38), (0.5, 0.38)])
+def test_the_shipped_models_are_for_two_gsds(gsd, expected):
+    shipped = suite.sets(Path(__file__).parents[2] / "models" / "research", PAIR)
+    one = suite.choose(shipped, gsd, None, None)
+    assert {model.contract["gsd"] for model in one.values()} == {expected}
 
 
 def test_the_set_that_covers_the_view_wins_over_a_better_gsd(tmp_path):
