@@ -145,6 +145,27 @@ def test_radiometry_keeps_shape_and_is_the_same_for_a_seed():
         np.testing.assert_array_equal(one, dataset.radiometry(rgb, np.random.default_rng(seed)))
 
 
+def test_repainted_roofs_keep_their_shading_and_the_ground_its_look():
+    rgb = np.full((64, 64, 3), 100, np.uint8)
+    labels = np.zeros((64, 64), np.int32)
+    for label, cols, grey in ((1, np.s_[10:24], 120), (2, np.s_[24:38], 60), (3, np.s_[46:60], 60)):
+        rgb[20:40, cols], labels[20:40, cols] = grey, label
+    rgb[50:60, 10:24], labels[50:60, 10:24] = 80, -1  # a roof without sections: its outline is not known well enough
+    sample = dataset.empty(rgb)._replace(labels=labels, roof=(labels != 0).astype(np.uint8))
+    ratios = []
+    for seed in range(20):
+        painted = dataset.repainted(sample, np.random.default_rng(seed))
+        sunny, shady, other = (painted.rgb[30, col].astype(float) for col in (16, 31, 53))
+        np.testing.assert_allclose(sunny, 2 * shady, atol=2)
+        ratios.append(other.mean() / shady.mean())
+        far = cv2.dilate((labels > 0).astype(np.uint8), np.ones((15, 15), np.uint8)) == 0
+        np.testing.assert_array_equal(painted.rgb[far], rgb[far])
+        np.testing.assert_array_equal(painted.labels, labels)
+    assert min(ratios) < 0.8 < 1.25 < max(ratios)  # each building has its own
+    darkest = min(dataset.repainted(sample, np.random.default_rng(seed)).rgb[30, 16].mean() for seed in range(20))
+    assert darkest < 50
+
+
 def test_kept_samples_come_back(marked, tmp_path):
     dataset.save(tmp_path / "a.npz", marked)
     back = dataset.load(tmp_path / "a.npz")
