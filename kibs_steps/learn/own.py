@@ -258,6 +258,7 @@ def main(argv: list[str] | None = None) -> None:
         "annotation": fingerprint.of_file(source, args.out / "fingerprints.json"),
         "split": {"rule": args.split, "seed": args.seed, "shares": SHARES, "tile": args.tile, "tiles": counts}
         | ({"square": args.square, "buffer": args.buffer} if by_blocks else {}),
+        "gsd": args.gsd,
         "view": scene.view and [scene.view.azimuth, scene.view.elevation],
         "sun": scene.sun and [scene.sun.azimuth, scene.sun.elevation],
         "corners": {

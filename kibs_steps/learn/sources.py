@@ -90,6 +90,13 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
         raise photographs.NoTrainingData(
             f"no training samples in {', '.join(args.own)}: make them with kibs_steps.learn.own"
         )
+    for folder in args.own:
+        gsd = store.read_json(Path(folder) / "own.json").get("gsd", args.gsd)
+        if gsd != args.gsd:
+            raise photographs.NoTrainingData(
+                f"{folder} holds samples at {gsd:g} m per px, the model is to be of {args.gsd:g}: "
+                f"make them again with learn.own --gsd={args.gsd:g}"
+            )
     view = _direction(args.view_azimuth, args.view_elevation)
     sun = _direction(args.sun_azimuth, args.sun_elevation)
     if args.tiles:

@@ -13,6 +13,7 @@ from kibs_steps.labels import rims
 
 IGNORED = 255
 HEIGHT_STRIDE = 4
+SURFACE_STRIDE = 2
 BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
 
 
@@ -35,9 +36,9 @@ def distance(labels: np.ndarray, clip: float) -> np.ndarray:
 
 
 def surface(kinds: np.ndarray, count: int) -> np.ndarray:
-    """Share of each of `count` kinds of surface in cells of HEIGHT_STRIDE px, float32 (count, h/4, w/4); zero where unknown."""
-    rows, cols = (n // HEIGHT_STRIDE for n in kinds.shape)
-    cells = kinds.reshape(rows, HEIGHT_STRIDE, cols, HEIGHT_STRIDE)
+    """Share of each of `count` kinds of surface in cells of SURFACE_STRIDE px, float32 (count, h/2, w/2); zero where unknown."""
+    rows, cols = (n // SURFACE_STRIDE for n in kinds.shape)
+    cells = kinds.reshape(rows, SURFACE_STRIDE, cols, SURFACE_STRIDE)
     shares = np.stack([(cells == kind).mean((1, 3)) for kind in range(count)]).astype(np.float32)
     shares[:, (cells == IGNORED).any((1, 3))] = 0
     return shares

@@ -9,13 +9,14 @@ from kibs_steps.learn import training  # noqa: E402
 from kibs_steps.learn.architectures import SWEPT, Sweep  # noqa: E402
 
 
-def test_sweep_finds_base_and_shadow_of_a_pole():
+@pytest.mark.parametrize(("stride", "block"), [(4, 1), (2, 2)])
+def test_sweep_finds_base_and_shadow_of_a_pole(stride, block):
     """A pole's top at height h, its base and its shadow's tip, each marked in a channel, meet at the top in the step of h."""
-    height, stride = 8.0, 4
+    height = 8.0
     view, sun = np.array([-1.0, -2.0]), np.array([2.0, 0.5])  # px per metre
     base = np.array([66.0, 70.0])
     top, tip = base + height * view, base + height * sun
-    features = torch.zeros(1, 2, 32, 32)
+    features = torch.zeros(1, 2, 32 * block, 32 * block)
     for channel, (col, row) in enumerate((base, tip)):
         # Bilinear weights of a point mark, so that reading there gives their sum of squares, the largest anywhere near.
         x, y = col / stride - 0.5, row / stride - 0.5
@@ -23,8 +24,8 @@ def test_sweep_finds_base_and_shadow_of_a_pole():
             for j in (int(x), int(x) + 1):
                 features[0, channel, i, j] = (1 - abs(x - j)) * (1 - abs(y - i))
     geometry = torch.tensor([[*view, *sun, 1.0, 1.0]], dtype=torch.float32)
-    read = Sweep(stride)(features, geometry).reshape(2, 2, len(SWEPT), 32, 32)
-    col, row = (top / stride - 0.5).round().astype(int)
+    read = Sweep(stride, block)(features, geometry).reshape(2, 2, len(SWEPT), 32, 32)
+    col, row = (top / (stride * block) - 0.5).round().astype(int)
     assert read[0, 0, :, row, col].argmax() == SWEPT.index(8)
     assert read[1, 1, :, row, col].argmax() == SWEPT.index(8)
 
@@ -40,7 +41,7 @@ def test_a_zoomed_network_is_the_same_network_on_a_larger_image():
         expected = plain.logits(large, geometry * torch.tensor([[1.5, 1.5, 1.5, 1.5, 1.0, 1.0]]))
         raw = zoomed.logits(small, geometry)
     assert raw["roof"].shape == (1, 1, 64, 64)
-    assert raw["surface"].shape[2:] == (16, 16)
+    assert raw["surface"].shape[2:] == (32, 32)
     for name in ("roof", "edge", "distance"):
         smaller = torch.nn.functional.interpolate(expected[name], size=(64, 64), mode="bilinear")
         assert torch.allclose(raw[name], smaller, atol=1e-5)

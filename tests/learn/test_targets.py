@@ -32,9 +32,10 @@ def test_distance_is_that_of_brute_force(labels):
 
 def test_surface_gives_the_shares_of_each_cell():
     kinds = np.zeros((8, 8), np.uint8)
-    kinds[:4, :4], kinds[0, 0], kinds[4:, 4:] = 1, 2, targets.IGNORED
+    kinds[:2, :2], kinds[0, 0], kinds[3, 3] = 1, 2, targets.IGNORED
     shares = targets.surface(kinds, 3)
-    np.testing.assert_allclose(shares[:, 0, 0], (0, 15 / 16, 1 / 16))
+    assert shares.shape == (3, 4, 4)
+    np.testing.assert_allclose(shares[:, 0, 0], (0, 3 / 4, 1 / 4))
     np.testing.assert_allclose(shares[:, 0, 1], (1, 0, 0))
     assert not shares[:, 1, 1].any()
 
