@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kibs_steps import cli, store
-from kibs_steps.learn import dataset, export, training, validation
+from kibs_steps.learn import export, training, validation
+from kibs_steps.learn.samples import Sample
 from kibs_steps.models import contract as contracts
 
 
@@ -60,9 +61,7 @@ def train(run: Ablation, folder: Path, common: Sequence[str]) -> dict[str, contr
     return models
 
 
-def judge(
-    run: Ablation, models: dict[str, contracts.Model], sets: dict[str, list[dataset.Sample]]
-) -> list[dict[str, Any]]:
+def judge(run: Ablation, models: dict[str, contracts.Model], sets: dict[str, list[Sample]]) -> list[dict[str, Any]]:
     """Rows of figures by set: sections with the decoding that suits the network best, corners where sections are true ones."""
     if not run.told:
         sets = {n: [s._replace(geometry=np.zeros(6, np.float32)) for s in samples] for n, samples in sets.items()}

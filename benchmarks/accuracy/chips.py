@@ -18,7 +18,8 @@ import numpy as np
 from benchmarks.accuracy.methods import Method
 from kibs_steps import metrics, photographs
 from kibs_steps.blend import blend
-from kibs_steps.learn import dataset, validation
+from kibs_steps.learn import validation
+from kibs_steps.learn.samples import Sample
 from kibs_steps.models import heads, runtime
 
 SIDE = 224  # px: within every model's tile, so that all see the same ground
@@ -34,7 +35,7 @@ class Found(NamedTuple):
     corners: np.ndarray
 
 
-def sets(data: Path, count: int, per_place: int, gsd: float) -> dict[str, list[dataset.Sample]]:
+def sets(data: Path, count: int, per_place: int, gsd: float) -> dict[str, list[Sample]]:
     """The samples of every set at the models' GSD, always the same ones."""
     found = {
         "B photographs": validation.photographed(data, data / "roofgraph" / "roofgraph.tar", count, SIDE, gsd),
@@ -50,7 +51,7 @@ def sets(data: Path, count: int, per_place: int, gsd: float) -> dict[str, list[d
     return {name: [middle(sample) for sample in samples] for name, samples in found.items()}
 
 
-def cut(chip: photographs.Chip, gsd: float) -> list[dataset.Sample]:
+def cut(chip: photographs.Chip, gsd: float) -> list[Sample]:
     """Windows of a chip at `gsd`, side by side: roofs known, nothing else."""
     scale = chip.gsd / gsd
     size = tuple(max(SIDE, round(n * scale)) for n in chip.building.shape[::-1])
@@ -62,17 +63,17 @@ def cut(chip: photographs.Chip, gsd: float) -> list[dataset.Sample]:
             part = np.s_[row : row + SIDE, col : col + SIDE]
             roof = np.ascontiguousarray(building[part])
             samples.append(
-                dataset.empty(np.ascontiguousarray(rgb[part]))._replace(
+                Sample.ground(np.ascontiguousarray(rgb[part]))._replace(
                     labels=-roof.astype(np.int32), roof=roof, corners_known=np.zeros_like(roof)
                 )
             )
     return samples
 
 
-def middle(sample: dataset.Sample) -> dataset.Sample:
+def middle(sample: Sample) -> Sample:
     """The middle SIDE px of a sample."""
     before = (sample.labels.shape[0] - SIDE) // 2
-    return dataset.window(sample, before, before, SIDE)
+    return sample.window(before, before, SIDE)
 
 
 class Runner:
@@ -93,7 +94,7 @@ class Runner:
             self._open = {key: {"sections": first, "corners": second}}
         return self._open[key]
 
-    def __call__(self, sample: dataset.Sample) -> Found:
+    def __call__(self, sample: Sample) -> Found:
         """Sections and corners of one sample, its rim mirrored up to the model's tile."""
         models = self.method.models
         tile = models["sections"].contract["tile"]
@@ -114,7 +115,7 @@ class Runner:
         return Found(labels, found.scores, place[((place >= 0) & (place < SIDE)).all(axis=1)])
 
 
-def figures(samples: Sequence[dataset.Sample], found: Sequence[Found]) -> dict[str, Any]:
+def figures(samples: Sequence[Sample], found: Sequence[Found]) -> dict[str, Any]:
     """Pixel IoU and, where sections or corners are known, their figures; all tiles together."""
     pairs = [(f.labels > 0, s.roof) for f, s in zip(found, samples, strict=True)]
     result: dict[str, Any] = {"tiles": len(samples), "iou": validation.roof_iou(pairs)}
@@ -125,7 +126,7 @@ def figures(samples: Sequence[dataset.Sample], found: Sequence[Found]) -> dict[s
     return result
 
 
-def section_figures(samples: Sequence[dataset.Sample], found: Sequence[Found]) -> dict[str, Any]:
+def section_figures(samples: Sequence[Sample], found: Sequence[Found]) -> dict[str, Any]:
     """AP50, mean best IoU, PQ. What lies mostly on unknown ground or on sections too small to ask for is left out."""
     tallies, scores, true_ids, found_ids = [], [], 0, 0
     for sample, one in zip(samples, found, strict=True):
@@ -153,7 +154,7 @@ def section_figures(samples: Sequence[dataset.Sample], found: Sequence[Found]) -
     return {key: all_figures[key] for key in ("truth", "predicted", "ap50", "mean_best_iou", "pq")}
 
 
-def corner_figures(samples: Sequence[dataset.Sample], found: Sequence[Found]) -> dict[str, Any]:
+def corner_figures(samples: Sequence[Sample], found: Sequence[Found]) -> dict[str, Any]:
     """Precision and recall of corners at 2 px where corners are known."""
     true, guessed = [], []
     for i, (sample, one) in enumerate(zip(samples, found, strict=True)):

@@ -22,8 +22,7 @@ import numpy as np
 
 from kibs_steps import cli, photographs, store
 from kibs_steps.errors import KibsError
-from kibs_steps.learn import dataset
-from kibs_steps.learn.dataset import Sample
+from kibs_steps.learn.samples import UNKNOWN, Sample
 
 if TYPE_CHECKING:
     from pycocotools.coco import COCO
@@ -160,7 +159,7 @@ def read(folder: str | Path, images: str | Path | None = None) -> Iterator[tuple
                 f"{pictures / image['file_name']} is {found}, {folder / 'sections.json'} speaks of "
                 f"{image['width']}×{image['height']} px: put images and annotations of one export together"
             )
-        sample = _with_sections(dataset.empty(np.ascontiguousarray(rgb[..., ::-1])), sections, key)
+        sample = _with_sections(Sample.ground(np.ascontiguousarray(rgb[..., ::-1])), sections, key)
         sample = _with_corners(sample, corners, by_name.get(image["file_name"]))
         geometry = np.asarray(image.get("geometry", np.zeros(6)), np.float32)
         yield Path(image["file_name"]).stem, sample._replace(geometry=geometry)
@@ -198,7 +197,7 @@ def _with_sections(sample: Sample, index: COCO, key: int) -> Sample:
     for annotation in sorted(index.imgToAnns[key], key=lambda a: (-a.get("iscrowd", 0), a["id"])):
         where = index.annToMask(annotation) > 0
         if annotation.get("iscrowd", 0):
-            labels[where], roof[where] = -1, annotation.get("roof", dataset.UNKNOWN)
+            labels[where], roof[where] = -1, annotation.get("roof", UNKNOWN)
         else:
             number += 1
             labels[where], roof[where] = number, 1
@@ -239,14 +238,14 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     if args.to == "samples":
         for name, sample in read(args.coco):
-            dataset.save(Path(args.samples) / f"{name}.npz", sample)
+            sample.save(Path(args.samples) / f"{name}.npz")
         return
     files = sorted(Path(args.samples).glob("[!.]*.npz"))
     if not files:
         raise photographs.NoTrainingData(
             f"{args.samples} holds no samples (*.npz): make some with kibs_steps.learn.own"
         )
-    named = ((path.stem, dataset.load(path)) for path in files)
+    named = ((path.stem, Sample.load(path)) for path in files)
     write(args.coco, named, paper_bins(args.highest), args.square)
 
 

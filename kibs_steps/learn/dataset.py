@@ -1,21 +1,22 @@
-"""Training tiles from three sources, and what may be done to them without making them untrue.
+"""Training tiles from their sources, and the endless mixture of them.
 
-A `Sample` is one tile with its truth, also partial truth (docs/architecture.md, "Training samples"). Sources: the simulator
-(exact truth), roof-graph photographs pasted into other ground (real roofs, sections and corners known, heights not), chips
-with building masks (real scenes of many places, roofs known, sections not). In: `photographs`. Out: samples.
+Sources: the simulator (exact truth), roof-graph photographs pasted into other ground (real roofs, sections and corners known,
+heights not), chips with building masks (real scenes of many places, roofs known, sections not), a user's own samples. In:
+`photographs`, files. Out: samples (`samples`), varied by `augmentation`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from rasterio.features import rasterize
 
-from kibs_steps.models import runtime
+from kibs_steps.learn import augmentation
+from kibs_steps.learn.samples import UNKNOWN, Sample
 from kibs_steps.photographs import GRAPH_GSD, REDUCED, Chip, NoTrainingData, RoofGraph
 
 if TYPE_CHECKING:
@@ -23,42 +24,8 @@ if TYPE_CHECKING:
     from kibs_steps.simulate.draped import House
 
 GSD = 0.38  # m per px of the models trained here, if no other is asked for
-AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their source
-REPAINTED = 0.3  # share of training tiles whose roofs get another brightness
-UNKNOWN = 255
-FORGOTTEN = 0.15  # share of training tiles whose view a network is not told; and whose sun
 LOOSE = 5  # px, width of the strip about a mask's outline of which nothing is asked
 NADIR = np.array([0, 0, 0, 0, 1, 0], np.float32)
-
-
-class Sample(NamedTuple):
-    """One tile (s, s) with its truth; see docs/architecture.md, "Training samples"."""
-
-    rgb: np.ndarray
-    labels: np.ndarray
-    roof: np.ndarray
-    height: np.ndarray
-    surface: np.ndarray
-    corners: np.ndarray
-    corner_heights: np.ndarray
-    corners_known: np.ndarray
-    geometry: np.ndarray
-
-
-def empty(rgb: np.ndarray) -> Sample:
-    """A sample of ground: no roofs, nothing unknown."""
-    size = rgb.shape[:2]
-    return Sample(
-        rgb,
-        np.zeros(size, np.int32),
-        np.zeros(size, np.uint8),
-        np.full(size, np.nan, np.float32),
-        np.full(size, UNKNOWN, np.uint8),
-        np.zeros((0, 2), np.float32),
-        np.zeros(0, np.float32),
-        np.ones(size, np.uint8),
-        np.zeros(6, np.float32),
-    )
 
 
 def simulated(
@@ -134,7 +101,7 @@ def chip_sample(chip: Chip, rng: np.random.Generator, size: int, gsd: float = GS
     building = mask > 127
     # A mask is shifted by a pixel or two and cuts corners: what it says of its outline would teach blurred rims.
     loose = cv2.morphologyEx(building.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((LOOSE, LOOSE), np.uint8)) > 0
-    sample = empty(rgb)
+    sample = Sample.ground(rgb)
     return sample._replace(
         labels=np.where(building | loose, -1, 0).astype(np.int32),
         roof=np.where(loose, np.uint8(UNKNOWN), building.astype(np.uint8)),
@@ -246,138 +213,6 @@ def _feathered(mask: np.ndarray, softness: float) -> np.ndarray:
     return np.clip(inner / (2 * softness + 1e-3), 0, 1).astype(np.float32)
 
 
-def dihedral(sample: Sample, k: int) -> Sample:
-    """The sample mirrored (k ≥ 4: columns reversed first) and turned by k % 4 quarter turns counter-clockwise.
-
-    Positions and the geometry's displacement vectors turn with the image.
-    """
-    turns = k % 4
-    size = sample.rgb.shape[0]
-
-    def image(a: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.rot90(a[:, ::-1] if k >= 4 else a, turns))
-
-    corners = sample.corners.copy()
-    vectors = sample.geometry[:4].reshape(2, 2).copy()
-    if k >= 4:
-        corners[:, 0] = size - corners[:, 0]
-        vectors[:, 0] = -vectors[:, 0]
-    for _ in range(turns):
-        corners = np.stack([corners[:, 1], size - corners[:, 0]], axis=1)
-        vectors = np.stack([vectors[:, 1], -vectors[:, 0]], axis=1)
-    return Sample(
-        *(image(a) for a in sample[:5]),
-        corners,
-        sample.corner_heights,
-        image(sample.corners_known),
-        np.concatenate([vectors.ravel(), sample.geometry[4:]]).astype(np.float32),
-    )
-
-
-def upright(sample: Sample, rng: np.random.Generator) -> Sample:
-    """The sample as the network sees tiles (`runtime.upright`): roofs lean up. Where nothing leans, any of its eight views."""
-    turn = int(rng.integers(8))
-    if not sample.geometry[:2].any():
-        return dihedral(sample, turn)
-    return next(s for s in (dihedral(sample, k) for k in range(8)) if runtime.leans_up(*s.geometry[:2]))
-
-
-def window(sample: Sample, row: int, col: int, size: int) -> Sample:
-    """The part of a sample from (row, col), `size` px wide and high."""
-    part = (slice(row, row + size), slice(col, col + size))
-    corners = sample.corners - np.float32([col, row])
-    inside = (corners >= 0).all(1) & (corners < size).all(1)
-    return Sample(
-        *(a[part] for a in sample[:5]),
-        corners[inside],
-        sample.corner_heights[inside],
-        sample.corners_known[part],
-        sample.geometry,
-    )
-
-
-def without_geometry(sample: Sample, rng: np.random.Generator, share: float = FORGOTTEN) -> Sample:
-    """Forgets now the view, now the sun, so that a network learns to do without."""
-    geometry = sample.geometry.copy()
-    for vector, flag in ((slice(0, 2), 4), (slice(2, 4), 5)):
-        if rng.random() < share:
-            geometry[vector] = 0
-            geometry[flag] = 0
-    return sample._replace(geometry=geometry)
-
-
-def radiometry(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Another sensor, stretch and weather over the same scene, uint8 (h, w, 3)."""
-    x = rgb.astype(np.float32) / 255
-    rows, cols = rgb.shape[:2]
-    if rng.random() < 0.4:  # coarser pixels drawn larger, as pansharpened and resampled imagery is
-        factor = rng.uniform(1.0, 1.7)
-        small = cv2.resize(x, (round(cols / factor), round(rows / factor)), interpolation=cv2.INTER_AREA)
-        x = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC if rng.random() < 0.5 else cv2.INTER_LINEAR)
-    if rng.random() < 0.3:
-        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 1.0))
-    if rng.random() < 0.25:  # colours coarser than brightness, as after pansharpening
-        grey = x.mean(2, keepdims=True)
-        x = grey + cv2.GaussianBlur(x - grey, (0, 0), rng.uniform(0.8, 2.5))
-    if rng.random() < 0.25:  # sharpened by the vendor
-        x = x + rng.uniform(0.2, 1.0) * (x - cv2.GaussianBlur(x, (0, 0), 1.0))
-    grey = x.mean(2, keepdims=True)
-    saturation = rng.uniform(0.0, 0.4) if rng.random() < 0.12 else np.exp(rng.normal(0, 0.3))
-    x = grey + saturation * (x - grey)
-    if rng.random() < 0.4:  # hue: mix the bands a little
-        mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
-        x = x @ (mix / mix.sum(1, keepdims=True)).T.astype(np.float32)
-    x = x * np.exp(rng.normal(0, 0.1, 3)).astype(np.float32)
-    low, high = np.percentile(x[::4, ::4], [1, 99])
-    if rng.random() < 0.5 and high > low + 0.05:  # stretched to its own range, as rasters for viewing are
-        x = (x - low) / (high - low) * rng.uniform(0.7, 1.05) + rng.uniform(-0.03, 0.12)
-    x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, 0.35))
-    x = 0.5 + np.exp(rng.normal(0, 0.2)) * (x - 0.5) + rng.normal(0, 0.07)
-    if rng.random() < 0.2:  # haze
-        veil = rng.uniform(0.05, 0.35)
-        x = (1 - veil) * x + veil * rng.uniform(0.6, 0.9, 3)
-    if rng.random() < 0.6:
-        x = x + rng.normal(0, rng.uniform(0.003, 0.035), x.shape)
-    out = (np.clip(x, 0, 1) * 255).astype(np.uint8)
-    if rng.random() < 0.25:
-        coded = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 95))])[1]
-        out = cv2.imdecode(coded, cv2.IMREAD_COLOR)
-    return np.ascontiguousarray(out, dtype=np.uint8)
-
-
-def repainted(sample: Sample, rng: np.random.Generator) -> Sample:
-    """The same roofs, building by building of other brightness and colour: black slate, weathered tiles.
-
-    Faces keep their shading to each other. Most get darker: dark roofs beside bright yards are what satellites show and
-    photographs of well-lit suburbs do not.
-    """
-    count, buildings = cv2.connectedComponents((sample.labels > 0).astype(np.uint8), connectivity=4)
-    street = rng.uniform(-1.3, 0.4)  # log of the gain: neighbours are alike
-    gains = np.exp(street + rng.normal(0, 0.25, (count, 1)) + rng.normal(0, 0.06, (count, 3)))
-    greyed = np.clip(rng.uniform(-0.5, 0.9) + rng.normal(0, 0.15, count), 0, 1)
-    gains[0], greyed[0] = 1.0, 0.0
-    rim = rng.uniform(0.5, 1.5)  # px: as the rims of the picture are mixed
-    gain = cv2.GaussianBlur(gains[buildings].astype(np.float32), (0, 0), rim)
-    share = cv2.GaussianBlur(greyed[buildings].astype(np.float32), (0, 0), rim)[..., None]
-    rgb = sample.rgb.astype(np.float32)
-    rgb = gain * (rgb + share * (rgb.mean(axis=2, keepdims=True) - rgb))
-    return sample._replace(rgb=np.clip(np.rint(rgb), 0, 255).astype(np.uint8))
-
-
-def save(path: str | Path, sample: Sample) -> None:
-    """Keep a sample in one compressed file."""
-    from kibs_steps import store
-
-    with store.whole(path, summed=False) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **sample._asdict())
-
-
-def load(path: str | Path) -> Sample:
-    """Read a kept sample."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return Sample(**{name: arrays[name] for name in Sample._fields})
-
-
 class Mixture:
     """Endless tiles for one task, the i-th always drawn with the same random numbers.
 
@@ -398,7 +233,7 @@ class Mixture:
         own: Sequence[Path] = (),
         upright: bool = True,
         gsd: float = GSD,
-        forget: float = FORGOTTEN,
+        forget: float = augmentation.FORGOTTEN,
     ):
         self.own, self.upright, self.gsd, self.forget = list(own), upright, gsd, forget
         self.pool, self.graphs, self.chips = pool, graphs, chips
@@ -419,9 +254,9 @@ class Mixture:
         source = rng.choice(4, p=shares / shares.sum())
         if source in (0, 3):
             files = self._kept if source == 0 else self.own
-            sample = load(files[rng.integers(len(files))])
+            sample = Sample.load(files[rng.integers(len(files))])
             row, col = rng.integers(0, [n - self.size + 1 for n in sample.labels.shape])
-            sample = window(sample, row, col, self.size)
+            sample = sample.window(row, col, self.size)
         else:
             sample = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size, self.gsd)
             if rng.random() < 0.5:
@@ -429,8 +264,14 @@ class Mixture:
                 sample = with_decoys(sample, other, rng)
             if source == 1:
                 sample = pasted_houses(sample, self.graphs, rng, gsd=self.gsd)
-        if rng.random() < REPAINTED:
-            sample = repainted(sample, rng)
-        sample = without_geometry(sample, rng, self.forget)
-        sample = upright(sample, rng) if self.upright else dihedral(sample, int(rng.integers(8)))
-        return sample if rng.random() < AS_IT_IS else sample._replace(rgb=radiometry(sample.rgb, rng))
+        if rng.random() < augmentation.REPAINTED:
+            sample = augmentation.repainted(sample, rng)
+        sample = augmentation.without_geometry(sample, rng, self.forget)
+        sample = (
+            augmentation.upright(sample, rng) if self.upright else augmentation.dihedral(sample, int(rng.integers(8)))
+        )
+        return (
+            sample
+            if rng.random() < augmentation.AS_IT_IS
+            else sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
+        )

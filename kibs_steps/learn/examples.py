@@ -1,6 +1,6 @@
 """Examples: a sample made into what a network is shown and what it is asked for.
 
-In: samples of `learn.dataset`. Out: image, geometry and targets by name, arrays that a DataLoader can stack.
+In: samples (`learn.samples`). Out: image, geometry and targets by name, arrays that a DataLoader can stack.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from kibs_steps.blend import blend
 from kibs_steps.learn import dataset, maskrcnn, targets
 from kibs_steps.learn.architectures import SURFACES
+from kibs_steps.learn.samples import Sample
 
 DISTANCE_CLIP = 5.0  # px
 BLEND = {"inside": [None, None, 255], "rim": [None, None, 128], "outside": [None, None, 0]}
@@ -31,9 +32,7 @@ class Examples(Dataset):
         return example_of(self.mixture[index], rng, self.family, self.task)
 
 
-def example(
-    sample: dataset.Sample, rng: np.random.Generator, blended: bool, task: str = "both"
-) -> dict[str, np.ndarray]:
+def example(sample: Sample, rng: np.random.Generator, blended: bool, task: str = "both") -> dict[str, np.ndarray]:
     """Image, plain or blended with sections as a model might find them, geometry and the targets of a task.
 
     A blended image shows the sections: what it is asked for is corners and heights.
@@ -64,19 +63,19 @@ def example(
     return found
 
 
-def example_of(sample: dataset.Sample, rng: np.random.Generator, family: str, task: str) -> dict[str, np.ndarray]:
+def example_of(sample: Sample, rng: np.random.Generator, family: str, task: str) -> dict[str, np.ndarray]:
     """The example of a sample that a run's family and task learn from."""
     if family == "maskrcnn":
         return maskrcnn.example(sample, task, supposed(sample, rng))
     return example(sample, rng, bool(rng.random() < BLENDED[task]), task)
 
 
-def painted(sample: dataset.Sample, rng: np.random.Generator) -> np.ndarray:
+def painted(sample: Sample, rng: np.random.Generator) -> np.ndarray:
     """The image (s, s, 3) uint8 blended with sections as a model might find them."""
     return blend(sample.rgb, supposed(sample, rng), **BLEND)
 
 
-def supposed(sample: dataset.Sample, rng: np.random.Generator) -> np.ndarray:
+def supposed(sample: Sample, rng: np.random.Generator) -> np.ndarray:
     """Section labels (s, s) as a model might find them: mostly wrong in the ways models are wrong."""
     labels = np.maximum(sample.labels, 0)
     areas = ndimage.label((sample.labels < 0) & (sample.roof == 1))[0]

@@ -18,6 +18,7 @@ from torch import nn
 from kibs_steps import cli, store
 from kibs_steps.learn import dataset, examples, losses, maskrcnn, sources, training
 from kibs_steps.learn.architectures import OUTPUTS
+from kibs_steps.learn.samples import Sample
 from kibs_steps.models import contract as contracts
 
 TILE, MARGIN = 512, 32  # px at dataset.GSD
@@ -132,7 +133,7 @@ def inherited(about: dict[str, Any], before: dict[str, Any] | None) -> dict[str,
 
 def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float] | None:
     """Mean and standard deviation (m) of the corners' heights in the first kept tiles of a pool; None without any."""
-    heights = [dataset.load(path).corner_heights for path in sorted(pool.glob("[!.]*.npz"))[:most]]
+    heights = [Sample.load(path).corner_heights for path in sorted(pool.glob("[!.]*.npz"))[:most]]
     known = np.concatenate([*heights, np.zeros(0, np.float32)])
     known = known[np.isfinite(known)]
     return (float(known.mean()), float(known.std())) if len(known) else None

@@ -5,7 +5,7 @@ ResNet-FPN model, from scratch unless weights are given. The network works at th
 resize a tile of 230 px to 229 when exported (it computes floor(230 · (230 · 1/230)) in float), which shifts every detection, so
 here it only pads.
 
-In: samples of `learn.dataset`. Out: for training, loss terms; for use, an ONNX file of head `instances` with raw 28 × 28 masks
+In: samples (`learn.samples`). Out: for training, loss terms; for use, an ONNX file of head `instances` with raw 28 × 28 masks
 (docs/architecture.md, Models). Needs torchvision; `NoTorchvision` says what to install where it cannot run.
 """
 
@@ -19,7 +19,7 @@ from torch import nn
 
 from kibs_steps.errors import KibsError
 from kibs_steps.learn import coco
-from kibs_steps.learn.dataset import Sample
+from kibs_steps.learn.samples import Sample
 
 TASKS = ("sections", "corners")
 OUTPUTS = ("boxes", "labels", "scores", "masks")

@@ -3,7 +3,7 @@
 In: a raster, its terrain and angles, and either roof sections with heights (PolygonZ, drawn where they are seen or where they
 stand, as `kibs_steps.truth` reads them: height = z − DTM at the ground-corrected position) or plain outlines of buildings as
 seen (roofs known, sections, corners and heights not). Out, below `--out`: `training/`, `validation/`, `testing/` with one
-`learn.dataset.Sample` per tile (npz); `truth.gpkg`, the annotation with its column `split`; `own.json`, which records inputs,
+`learn.samples.Sample` per tile (npz); `truth.gpkg`, the annotation with its column `split`; `own.json`, which records inputs,
 rule, seed and counts. The same inputs and seed give the same tiles in the same sets.
 
 Two splits, 60/20/20. `shuffle` is the paper's: tiles in random order; neighbours share roofs and margins, so its test set is
@@ -26,6 +26,7 @@ from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Window
 from kibs_steps.learn import dataset
+from kibs_steps.learn.samples import UNKNOWN, Sample
 from kibs_steps.models import runtime
 from kibs_steps.scene import Scene
 from kibs_steps.simulate import rendering
@@ -87,7 +88,7 @@ def in_blocks(found: list[Place], seed: int, block: int, buffer: int) -> NDArray
     return code
 
 
-def section_sample(scene: Scene, sections: Truth, window: Window, unknown: NDArray[np.bool_]) -> dataset.Sample:
+def section_sample(scene: Scene, sections: Truth, window: Window, unknown: NDArray[np.bool_]) -> Sample:
     """One tile with its sections, seen heights and corners; `unknown` (h, w) is where nothing was annotated."""
     rgb, valid = tiles.read_window(scene, window)
     seen, height = truth.visible_labels(sections, scene, window.grown(2))
@@ -101,11 +102,11 @@ def section_sample(scene: Scene, sections: Truth, window: Window, unknown: NDArr
     shown = vertices.seen.copy()
     row, col = np.clip(np.floor(place[:, ::-1]).astype(int), 0, window.width - 1).T
     shown &= ~blank[row, col]
-    return dataset.empty(rgb)._replace(
+    return Sample.ground(rgb)._replace(
         labels=labels,
-        roof=np.where(blank, dataset.UNKNOWN, labels > 0).astype(np.uint8),
+        roof=np.where(blank, UNKNOWN, labels > 0).astype(np.uint8),
         height=np.where(labels > 0, height, np.nan).astype(np.float32),
-        surface=np.where(labels > 0, rendering.ON_ROOF, dataset.UNKNOWN).astype(np.uint8),
+        surface=np.where(labels > 0, rendering.ON_ROOF, UNKNOWN).astype(np.uint8),
         corners=place[shown].astype(np.float32),
         corner_heights=vertices.height[shown].astype(np.float32),
         corners_known=(~blank).astype(np.uint8),
@@ -113,18 +114,16 @@ def section_sample(scene: Scene, sections: Truth, window: Window, unknown: NDArr
     )
 
 
-def building_sample(
-    scene: Scene, outlines: NDArray[np.object_], window: Window, unknown: NDArray[np.bool_]
-) -> dataset.Sample:
+def building_sample(scene: Scene, outlines: NDArray[np.object_], window: Window, unknown: NDArray[np.bool_]) -> Sample:
     """One tile of which only the buildings are known; outlines in image coordinates (px)."""
     rgb, valid = tiles.read_window(scene, window)
     building = drawn(outlines, window)
     blank = unknown | ~valid
     near = cv2.dilate(building.astype(np.uint8), np.ones((2 * DOUBT + 1,) * 2)) > 0
-    return dataset.empty(rgb)._replace(
+    return Sample.ground(rgb)._replace(
         labels=np.where(blank | building, -1, 0).astype(np.int32),
-        roof=np.where(blank, dataset.UNKNOWN, building).astype(np.uint8),
-        surface=np.where(building & ~blank, rendering.ON_ROOF, dataset.UNKNOWN).astype(np.uint8),
+        roof=np.where(blank, UNKNOWN, building).astype(np.uint8),
+        surface=np.where(building & ~blank, rendering.ON_ROOF, UNKNOWN).astype(np.uint8),
         corners_known=(~(near | blank)).astype(np.uint8),
         geometry=geometry_of(scene),
     )
@@ -245,7 +244,7 @@ def main(argv: list[str] | None = None) -> None:
             sample = section_sample(scene, sections, window, unknown)
         if own == 0:
             heights.append(sample.corner_heights)
-        dataset.save(args.out / SPLITS[own] / f"r{place.row:03d}c{place.col:03d}.npz", sample)
+        sample.save(args.out / SPLITS[own] / f"r{place.row:03d}c{place.col:03d}.npz")
     if sections is not None:
         middle = shapely.get_coordinates(shapely.point_on_surface(shapely.force_2d(sections.seen)))
         write_truth(args.out / "truth.gpkg", sections, scene, codes_of(middle, found, code))

@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 
 from kibs_steps import photographs, store
-from kibs_steps.learn import dataset
+from kibs_steps.learn import augmentation, dataset
+from kibs_steps.learn.samples import Sample
 from kibs_steps.simulate import citymodel, draped
 
 NAMES = ("simulated", "pasted", "chips", "own")
@@ -35,7 +36,7 @@ class Sources(NamedTuple):
     """Training tiles, validation samples, and `trained_on` of the contract (with `corner_heights`: mean, σ in m)."""
 
     mixture: dataset.Mixture
-    validation: list[dataset.Sample]
+    validation: list[Sample]
     about: dict[str, Any]
 
 
@@ -54,7 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that simulated tiles show parts of")
     parser.add_argument("--shares", type=shares, default={}, help="as in simulated=0.5,pasted=0.2,chips=0.1,own=0.2")
     parser.add_argument(
-        "--forget", type=float, default=dataset.FORGOTTEN, help="share of tiles whose view, and whose sun, is not told"
+        "--forget",
+        type=float,
+        default=augmentation.FORGOTTEN,
+        help="share of tiles whose view, and whose sun, is not told",
     )
     parser.add_argument("--validation", type=int, default=0, help="simulated validation tiles, besides the own ones")
     for name in ("view", "sun"):
@@ -113,7 +117,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
     kept = [path for folder in args.own for path in sorted(Path(folder, "validation").glob("[!.]*.npz"))]
-    validation = [dataset.load(path) for path in kept]
+    validation = [Sample.load(path) for path in kept]
     validation += [
         dataset.simulated(np.random.default_rng([args.seed, HELD_OUT + i]), view=view, sun=sun, gsd=args.gsd)
         for i in range(args.validation)
@@ -123,11 +127,11 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
 
 
-def prepared(sample: dataset.Sample, size: int, upright: bool) -> dataset.Sample:
+def prepared(sample: Sample, size: int, upright: bool) -> Sample:
     """The middle of a validation sample, upright if the network sees it so."""
     rows, cols = sample.labels.shape
-    part = dataset.window(sample, (rows - size) // 2, (cols - size) // 2, size)
-    return dataset.upright(part, np.random.default_rng(0)) if upright else part
+    part = sample.window((rows - size) // 2, (cols - size) // 2, size)
+    return augmentation.upright(part, np.random.default_rng(0)) if upright else part
 
 
 def about(
@@ -202,7 +206,7 @@ def fill_pool(
             sample = dataset.simulated(
                 rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities, houses=houses, gsd=gsd
             )
-            dataset.save(path, sample)
+            sample.save(path)
 
 
 def _wait_for_first(pool: Path, seconds: float = 600.0) -> None:

@@ -1,6 +1,6 @@
 """What the network is asked for, drawn from a sample's labels: rims, distances, perturbed sections, corners, heights.
 
-In: arrays of one tile as in `learn.dataset.Sample`. Out: target maps of the same tile; pixels that say nothing carry the
+In: arrays of one tile as in `learn.samples.Sample`. Out: target maps of the same tile; pixels that say nothing carry the
 value IGNORED (masks) or NaN (heights). Pure functions.
 """
 

@@ -22,13 +22,14 @@ from kibs_steps import cli, photographs, store
 from kibs_steps.blend import blend
 from kibs_steps.labels import rims
 from kibs_steps.learn import calibration, dataset
+from kibs_steps.learn.samples import UNKNOWN, Sample
 from kibs_steps.models import contract as contracts
 from kibs_steps.models import heads, runtime, scoring
 
 SMALLEST = 12  # px: smaller true sections are neither asked for nor held against a model
 
 
-Decoded = tuple[Sequence[dict[str, np.ndarray]], Sequence[dataset.Sample]]  # a model's maps of the samples of a set
+Decoded = tuple[Sequence[dict[str, np.ndarray]], Sequence[Sample]]  # a model's maps of the samples of a set
 
 
 class Match(NamedTuple):
@@ -88,13 +89,13 @@ def roof_iou(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
     """IoU of found (bool) and true (0, 1, 255 unknown) roof pixels over all tiles."""
     both = either = 0
     for found, truth in pairs:
-        known, true = truth != dataset.UNKNOWN, truth == 1
+        known, true = truth != UNKNOWN, truth == 1
         both += (found & true & known).sum()
         either += ((found | true) & known).sum()
     return float(both / max(either, 1))
 
 
-def village(folder: str | Path, size: int, gsd: float = dataset.GSD) -> list[dataset.Sample]:
+def village(folder: str | Path, size: int, gsd: float = dataset.GSD) -> list[Sample]:
     """The real village scenes at `gsd`, mirrored at the border to (size, size); the rim beyond is unknown.
 
     Connected areas of one slope orientation are sections; roof without an orientation has unknown sections.
@@ -116,11 +117,11 @@ def village(folder: str | Path, size: int, gsd: float = dataset.GSD) -> list[dat
         before = (size - side) // 2
         around = (before, size - side - before)
         mirrored = np.pad(small, (around, around, (0, 0)), mode="symmetric")
-        sample = dataset.empty(mirrored)
+        sample = Sample.ground(mirrored)
         samples.append(
             sample._replace(
                 labels=np.pad(labels, around, constant_values=-1),
-                roof=np.pad((labels != 0).astype(np.uint8), around, constant_values=dataset.UNKNOWN),
+                roof=np.pad((labels != 0).astype(np.uint8), around, constant_values=UNKNOWN),
                 geometry=dataset.NADIR.copy(),
                 corners_known=np.zeros((size, size), np.uint8),
             )
@@ -136,9 +137,7 @@ def _photograph(path: Path) -> np.ndarray:
             return np.ascontiguousarray(file.read([1, 2, 3]).transpose(1, 2, 0))
 
 
-def simulated(
-    count: int, size: int, view_elevation: tuple[float, float], gsd: float = dataset.GSD
-) -> list[dataset.Sample]:
+def simulated(count: int, size: int, view_elevation: tuple[float, float], gsd: float = dataset.GSD) -> list[Sample]:
     """Simulated scenes of seeds no training uses, seen from the elevations (deg) given."""
     return [
         dataset.simulated(np.random.default_rng([424242, i]), size, view_elevation=view_elevation, gsd=gsd)
@@ -146,7 +145,7 @@ def simulated(
     ]
 
 
-def photographed(data: Path, source: Path, count: int, size: int, gsd: float = dataset.GSD) -> list[dataset.Sample]:
+def photographed(data: Path, source: Path, count: int, size: int, gsd: float = dataset.GSD) -> list[Sample]:
     """Held-out roof photographs pasted into chips; unlike in training, the radiometry is left as it is.
 
     They alone are judged, with the sure ground about them: what a chip shows is context, its mask too coarse to judge rims by.
@@ -158,14 +157,12 @@ def photographed(data: Path, source: Path, count: int, size: int, gsd: float = d
         rng = np.random.default_rng([434343, i])
         ground = dataset.chip_sample(chips[rng.integers(len(chips))], rng, size, gsd)
         nothing = np.zeros_like(ground.roof)
-        ground = ground._replace(
-            labels=nothing.astype(np.int32) - 1, roof=nothing + dataset.UNKNOWN, corners_known=nothing
-        )
+        ground = ground._replace(labels=nothing.astype(np.int32) - 1, roof=nothing + UNKNOWN, corners_known=nothing)
         samples.append(dataset.pasted_houses(ground, graphs, rng, gsd=gsd))
     return samples
 
 
-def raw_sections(model: contracts.Model, samples: Sequence[dataset.Sample]) -> list[dict[str, np.ndarray]]:
+def raw_sections(model: contracts.Model, samples: Sequence[Sample]) -> list[dict[str, np.ndarray]]:
     """A sections model's maps of every sample."""
     return [runtime.open_network(model, sample.geometry[None], threads=1)(sample.rgb) for sample in samples]
 
@@ -173,7 +170,7 @@ def raw_sections(model: contracts.Model, samples: Sequence[dataset.Sample]) -> l
 def judge_sections(
     raw: Sequence[dict[str, np.ndarray]],
     found: Sequence[heads.Sections],
-    samples: Sequence[dataset.Sample],
+    samples: Sequence[Sample],
     roof: float,
 ) -> dict[str, float]:
     """Roof IoU at the threshold `roof`, AP at overlaps 0.5 and 0.75, true and found sections."""
@@ -223,7 +220,7 @@ def best_decoding(sets: Sequence[Decoded], contract: dict[str, Any]) -> tuple[di
 
 def judge_corners(
     model: contracts.Model,
-    samples: Sequence[dataset.Sample],
+    samples: Sequence[Sample],
     sections: Sequence[np.ndarray],
     reach: float = 3.0,
 ) -> dict[str, float]:
@@ -262,7 +259,7 @@ def judge_corners(
 
 
 def picture(
-    sample: dataset.Sample, raw: dict[str, np.ndarray], found: heads.Sections, corners: np.ndarray | None = None
+    sample: Sample, raw: dict[str, np.ndarray], found: heads.Sections, corners: np.ndarray | None = None
 ) -> np.ndarray:
     """Side by side, uint8 RGB: image; truth; roof probability (red), edge (green), distance (blue); what was found."""
     truth, outcome = sample.rgb.copy(), sample.rgb.copy()

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks.accuracy import __main__ as program
 from benchmarks.accuracy import chips, methods, scenes, table
-from kibs_steps.learn import dataset
+from kibs_steps.learn.samples import UNKNOWN, Sample
 from kibs_steps.models import contract
 
 S = chips.SIDE
@@ -20,12 +20,12 @@ S = chips.SIDE
 
 def tile(seed=0):
     """Two sections of a roof, a speck, and ground whose sections are unknown."""
-    made = dataset.empty(np.zeros((S, S, 3), np.uint8))
+    made = Sample.ground(np.zeros((S, S, 3), np.uint8))
     made.labels[20:40, 10:50], made.labels[40:60, 10:50], made.labels[100:102, 100:103] = 1, 2, 3
     made.labels[150:, 150:] = -1
     made.corners_known[150:, 150:] = 0
     made.roof[made.labels > 0] = 1
-    made.roof[150:, 150:] = dataset.UNKNOWN
+    made.roof[150:, 150:] = UNKNOWN
     return made._replace(corners=np.float32([[10, 20], [50, 20], [10, 60], [50, 60]]))
 
 
@@ -87,7 +87,7 @@ def test_a_runner_sees_the_tile_where_it_is(tmp_path):
     side, chips.SIDE = chips.SIDE, 48
     try:
         rgb = toy.paint([(8, 8, 20, 16, 50, (3.0, 3.0, 5.0, 5.0))], 48, 48)
-        found = chips.Runner(method)(dataset.empty(rgb))
+        found = chips.Runner(method)(Sample.ground(rgb))
     finally:
         chips.SIDE = side
     assert (found.labels[10:22, 10:26] > 0).all()

@@ -9,21 +9,22 @@ from hypothesis import strategies as st
 
 pytest.importorskip("pycocotools", reason="COCO needs the extra `learn` (pycocotools)")
 
-from kibs_steps.learn import coco, dataset
+from kibs_steps.learn import coco
+from kibs_steps.learn.samples import UNKNOWN, Sample
 
 SIZE = 40
 
 
-def sample(seed: int = 0) -> dataset.Sample:
+def sample(seed: int = 0) -> Sample:
     """Two sections of one roof, a roof whose sections are unknown, and ground nobody looked at."""
     rng = np.random.default_rng(seed)
-    made = dataset.empty(rng.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8))
+    made = Sample.ground(rng.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8))
     made.labels[5:12, 4:20] = 1
     made.labels[12:20, 4:20] = 2
     made.labels[25:30, 25:35] = -1
     made.labels[35:, :] = -1
     made.roof[made.labels != 0] = 1
-    made.roof[35:, :] = dataset.UNKNOWN
+    made.roof[35:, :] = UNKNOWN
     made.corners_known[33:, :] = 0
     return made._replace(
         corners=np.float32([[4.25, 5.5], [20, 5], [0.5, 39.5], [39.9, 0.1]]),
@@ -32,7 +33,7 @@ def sample(seed: int = 0) -> dataset.Sample:
     )
 
 
-def equal(one: dataset.Sample, other: dataset.Sample) -> None:
+def equal(one: Sample, other: Sample) -> None:
     for name in ("rgb", "labels", "roof", "corners", "corner_heights", "corners_known", "geometry"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 

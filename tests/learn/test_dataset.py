@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from kibs_steps import photographs
-from kibs_steps.learn import dataset
+from kibs_steps.learn import augmentation, dataset
+from kibs_steps.learn.samples import UNKNOWN, Sample
 
 
 @pytest.fixture
-def marked() -> dataset.Sample:
+def marked() -> Sample:
     """Ground with one house, a white dot at its only corner, and the same dot's displacement at 1 m as geometry."""
     size = 32
-    sample = dataset.empty(np.zeros((size, size, 3), np.uint8))
+    sample = Sample.ground(np.zeros((size, size, 3), np.uint8))
     sample.rgb[5, 20] = 255
     sample.labels[5:9, 20:26] = 1
     sample.rgb[5 + 3, 20 - 7] = 128  # the corner moved by the view's vector
@@ -30,7 +31,7 @@ def marked() -> dataset.Sample:
 
 @pytest.mark.parametrize("k", range(8))
 def test_dihedral_moves_corners_labels_and_vectors_with_the_image(marked, k):
-    turned = dataset.dihedral(marked, k)
+    turned = augmentation.dihedral(marked, k)
     col, row = np.floor(turned.corners[0]).astype(int)
     assert (turned.rgb[row, col] == 255).all()
     assert turned.labels[row, col] == 1
@@ -41,15 +42,15 @@ def test_dihedral_moves_corners_labels_and_vectors_with_the_image(marked, k):
 
 
 def test_window_keeps_only_its_corners(marked):
-    part = dataset.window(marked, 2, 12, 16)
+    part = marked.window(2, 12, 16)
     assert part.rgb.shape == (16, 16, 3)
     np.testing.assert_allclose(part.corners, [[8.5, 3.5]])
     assert (part.rgb[3, 8] == 255).all()
-    assert len(dataset.window(marked, 16, 0, 16).corners) == 0
+    assert len(marked.window(16, 0, 16).corners) == 0
 
 
 def test_forgotten_geometry_is_zero_and_flagged(marked):
-    forgotten = dataset.without_geometry(marked, np.random.default_rng(0), share=1.0)
+    forgotten = augmentation.without_geometry(marked, np.random.default_rng(0), share=1.0)
     assert not forgotten.geometry.any()
     assert marked.geometry.any()
 
@@ -102,7 +103,7 @@ def test_pasted_houses_lie_under_their_labels(tmp_path):
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(content)
     graphs = photographs.read_roof_graphs(tmp_path)
-    ground = dataset.empty(np.full((128, 128, 3), 30, np.uint8))
+    ground = Sample.ground(np.full((128, 128, 3), 30, np.uint8))
     sample = dataset.pasted_houses(ground, graphs, np.random.default_rng(3))
     inside = cv2.erode((sample.labels > 0).astype(np.uint8), np.ones((3, 3))) > 0
     assert inside.sum() > 20
@@ -111,7 +112,7 @@ def test_pasted_houses_lie_under_their_labels(tmp_path):
     assert (red[(sample.labels == 0) & (sample.roof == 0)] < 60).mean() > 0.95
     assert (sample.roof[sample.labels > 0] == 1).all()
     assert np.isnan(sample.corner_heights).all()
-    assert (sample.labels[sample.roof == dataset.UNKNOWN] == -1).all()
+    assert (sample.labels[sample.roof == UNKNOWN] == -1).all()
 
 
 def test_chip_samples_know_roofs_and_not_sections():
@@ -120,7 +121,7 @@ def test_chip_samples_know_roofs_and_not_sections():
     chip = photographs.Chip("x", np.where(building[..., None], 200, 20).astype(np.uint8).repeat(3, 2), building, 0.3)
     sample = dataset.chip_sample(chip, np.random.default_rng(0), 96)
     assert set(np.unique(sample.labels)) == {-1, 0}
-    known = sample.roof != dataset.UNKNOWN
+    known = sample.roof != UNKNOWN
     agree = (sample.rgb[..., 0] > 110) == (sample.roof == 1)
     assert agree[known].all()
     assert (sample.labels[~known] == -1).all()
@@ -139,10 +140,10 @@ def test_a_finer_gsd_shows_a_house_larger():
 def test_radiometry_keeps_shape_and_is_the_same_for_a_seed():
     rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     for seed in range(20):
-        one = dataset.radiometry(rgb, np.random.default_rng(seed))
+        one = augmentation.radiometry(rgb, np.random.default_rng(seed))
         assert one.shape == rgb.shape
         assert one.dtype == np.uint8
-        np.testing.assert_array_equal(one, dataset.radiometry(rgb, np.random.default_rng(seed)))
+        np.testing.assert_array_equal(one, augmentation.radiometry(rgb, np.random.default_rng(seed)))
 
 
 def test_repainted_roofs_keep_their_shading_and_the_ground_its_look():
@@ -151,10 +152,10 @@ def test_repainted_roofs_keep_their_shading_and_the_ground_its_look():
     for label, cols, grey in ((1, np.s_[10:24], 120), (2, np.s_[24:38], 60), (3, np.s_[46:60], 60)):
         rgb[20:40, cols], labels[20:40, cols] = grey, label
     rgb[50:60, 10:24], labels[50:60, 10:24] = 80, -1  # a roof without sections: its outline is not known well enough
-    sample = dataset.empty(rgb)._replace(labels=labels, roof=(labels != 0).astype(np.uint8))
+    sample = Sample.ground(rgb)._replace(labels=labels, roof=(labels != 0).astype(np.uint8))
     ratios = []
     for seed in range(20):
-        painted = dataset.repainted(sample, np.random.default_rng(seed))
+        painted = augmentation.repainted(sample, np.random.default_rng(seed))
         sunny, shady, other = (painted.rgb[30, col].astype(float) for col in (16, 31, 53))
         np.testing.assert_allclose(sunny, 2 * shady, atol=2)
         ratios.append(other.mean() / shady.mean())
@@ -162,13 +163,13 @@ def test_repainted_roofs_keep_their_shading_and_the_ground_its_look():
         np.testing.assert_array_equal(painted.rgb[far], rgb[far])
         np.testing.assert_array_equal(painted.labels, labels)
     assert min(ratios) < 0.8 < 1.25 < max(ratios)  # each building has its own
-    darkest = min(dataset.repainted(sample, np.random.default_rng(seed)).rgb[30, 16].mean() for seed in range(20))
+    darkest = min(augmentation.repainted(sample, np.random.default_rng(seed)).rgb[30, 16].mean() for seed in range(20))
     assert darkest < 50
 
 
 def test_kept_samples_come_back(marked, tmp_path):
-    dataset.save(tmp_path / "a.npz", marked)
-    back = dataset.load(tmp_path / "a.npz")
+    marked.save(tmp_path / "a.npz")
+    back = Sample.load(tmp_path / "a.npz")
     for one, other in zip(marked, back, strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -13,16 +13,17 @@ if not torchvision_cpu_ops.usable():
     pytest.skip("Mask R-CNN needs the extra `learn` (torchvision)", allow_module_level=True)
 
 from kibs_steps.blend import blend  # noqa: E402
-from kibs_steps.learn import dataset, export, maskrcnn, training  # noqa: E402
+from kibs_steps.learn import export, maskrcnn, training  # noqa: E402
+from kibs_steps.learn.samples import Sample  # noqa: E402
 from kibs_steps.models import contract as contracts  # noqa: E402
 from kibs_steps.models import heads, runtime  # noqa: E402
 
 SIZE = 96
 
 
-def sample() -> dataset.Sample:
+def sample() -> Sample:
     """A gable roof whose corners are known, a speck too small to ask for, and unknown ground."""
-    made = dataset.empty(np.random.default_rng(0).integers(40, 90, (SIZE, SIZE, 3), dtype=np.uint8))
+    made = Sample.ground(np.random.default_rng(0).integers(40, 90, (SIZE, SIZE, 3), dtype=np.uint8))
     made.labels[20:40, 10:50], made.labels[40:60, 10:50], made.labels[80:82, 80:84] = 1, 2, 3
     made.labels[70:, :20] = -1
     made.corners_known[70:, :20] = 0

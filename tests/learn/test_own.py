@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from kibs_steps import view
 from kibs_steps.grid import Grid, Window
-from kibs_steps.learn import dataset, own
+from kibs_steps.learn import own
+from kibs_steps.learn.samples import UNKNOWN, Sample
 from kibs_steps.scene import Direction, convergence
 from kibs_steps.simulate import scene as simulation
 
@@ -40,7 +41,7 @@ def prepare(city, out, *options):
     own.main(
         [f"--raster={folder}/scene.tif", f"--dtm={folder}/dtm.tif", *ANGLES, f"--tile={TILE}", f"--out={out}", *options]
     )
-    samples = {p.stem: (p.parent.name, dataset.load(p)) for p in sorted(out.glob("*/r*.npz"))}
+    samples = {p.stem: (p.parent.name, Sample.load(p)) for p in sorted(out.glob("*/r*.npz"))}
     return samples, json.loads((out / "own.json").read_text())
 
 
@@ -120,7 +121,7 @@ def test_buildings_without_sections(city, tmp_path):
     for name, (_, sample) in samples.items():
         window = window_of(name)
         true = rendering.section[window.row : window.row + TILE, window.col : window.col + TILE] > 0
-        known = sample.roof != dataset.UNKNOWN
+        known = sample.roof != UNKNOWN
         assert ((sample.roof == 1) >= true)[known].mean() > 0.99
         assert (sample.labels[sample.roof == 1] == -1).all()
         assert (sample.labels[sample.roof == 0] == 0).all()

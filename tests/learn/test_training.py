@@ -5,8 +5,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs the extra `learn` (torch)")
 
-from kibs_steps.learn import dataset, examples, training  # noqa: E402
+from kibs_steps.learn import examples, training  # noqa: E402
 from kibs_steps.learn.architectures import CHANNELS, Dense  # noqa: E402
+from kibs_steps.learn.samples import UNKNOWN, Sample  # noqa: E402
 from kibs_steps.models.contract import ContractMismatch  # noqa: E402
 
 
@@ -14,7 +15,7 @@ class Tiles(torch.utils.data.Dataset):
     """The same house everywhere."""
 
     def __init__(self):
-        sample = dataset.empty(np.full((64, 64, 3), 60, np.uint8))
+        sample = Sample.ground(np.full((64, 64, 3), 60, np.uint8))
         sample.rgb[20:40, 10:50] = 200
         sample.labels[20:40, 10:50] = 1
         sample = sample._replace(
@@ -56,7 +57,7 @@ def test_another_run_is_not_overwritten(tmp_path):
 
 def logits() -> dict[str, torch.Tensor]:
     """Blank logits of a 64 px tile, by name, that ask for gradients."""
-    sides = {"surface": (5, 16), "height": (len(training.CENTRES), 16), "slope": (2, 16)}
+    sides = {"surface": (5, 32), "height": (len(training.CENTRES), 16), "slope": (2, 16)}
     sides |= {name: (channels, 64) for name, channels in CHANNELS.items()}
     return {name: torch.zeros(1, c, side, side, requires_grad=True) for name, (c, side) in sides.items()}
 
@@ -68,7 +69,7 @@ def batch_of(example: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
 def test_unknown_ground_gives_no_gradient():
     sample = Tiles().sample
     sample.labels[:, 32:] = -1
-    sample.roof[:, 32:] = dataset.UNKNOWN
+    sample.roof[:, 32:] = UNKNOWN
     sample.corners_known[:, 32:] = 0
     sample.height[:, 32:] = np.nan
     sample = sample._replace(corners=sample.corners[::3], corner_heights=sample.corner_heights[::3])

@@ -7,6 +7,7 @@ import pytest
 
 from kibs_steps import photographs, store
 from kibs_steps.learn import dataset, sources
+from kibs_steps.learn.samples import Sample
 
 
 def arguments(*words):
@@ -21,9 +22,9 @@ def own(folder, view=(120.0, 65.0), count=10, mean=5.0, sigma=1.0, gsd=dataset.G
     """A folder as `learn.own` leaves it: four training tiles, one to validate on, the record."""
     for name, n in (("training", 4), ("validation", 1)):
         for i in range(n):
-            sample = dataset.empty(np.full((64, 64, 3), 10 * i, np.uint8))
+            sample = Sample.ground(np.full((64, 64, 3), 10 * i, np.uint8))
             sample.labels[10:30, 10:40] = 1
-            dataset.save(folder / name / f"r000c{i:03d}.npz", sample)
+            sample.save(folder / name / f"r000c{i:03d}.npz")
     corners = {"count": count, "mean_height": mean, "sigma": sigma}
     record = {"gsd": gsd, "view": view and list(view), "sun": None, "corners": corners}
     store.write_json(folder / "own.json", record)

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from kibs_steps.learn import dataset, validation
+from kibs_steps.learn import validation
+from kibs_steps.learn.samples import Sample
 from kibs_steps.models import heads
 
 
@@ -71,7 +72,7 @@ def shown(labels: np.ndarray, rim: float) -> dict[str, np.ndarray]:
 def test_the_best_decoding_keeps_apart_what_is_apart():
     labels = np.zeros((64, 64), np.int32)
     labels[8:30, 8:30], labels[8:30, 30:52], labels[36:60, 8:52] = 1, 2, 3
-    sample = dataset.empty(np.zeros((64, 64, 3), np.uint8))
+    sample = Sample.ground(np.zeros((64, 64, 3), np.uint8))
     sample = sample._replace(labels=labels, roof=(labels > 0).astype(np.uint8))
     contract = {"head": "dense", "thresholds": {"roof": 0.95, "prominence": 0.9, "min_area": 12}}
     sets = [([shown(labels, 0.6)], [sample]), ([shown(labels, 0.8)], [sample])]

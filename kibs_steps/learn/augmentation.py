@@ -1,0 +1,120 @@
+"""Augmentation: what may be done to a training tile without making its truth untrue.
+
+In and out: samples. Directions, radiometry and the brightness of roofs vary; geometry stays what it is.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from kibs_steps.learn.samples import Sample
+from kibs_steps.models import runtime
+
+AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their source
+FORGOTTEN = 0.15  # share of training tiles whose view a network is not told; and whose sun
+REPAINTED = 0.3  # share of training tiles whose roofs get another brightness
+
+
+def dihedral(sample: Sample, k: int) -> Sample:
+    """The sample mirrored (k ≥ 4: columns reversed first) and turned by k % 4 quarter turns counter-clockwise.
+
+    Positions and the geometry's displacement vectors turn with the image.
+    """
+    turns = k % 4
+    size = sample.rgb.shape[0]
+
+    def image(a: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(a[:, ::-1] if k >= 4 else a, turns))
+
+    corners = sample.corners.copy()
+    vectors = sample.geometry[:4].reshape(2, 2).copy()
+    if k >= 4:
+        corners[:, 0] = size - corners[:, 0]
+        vectors[:, 0] = -vectors[:, 0]
+    for _ in range(turns):
+        corners = np.stack([corners[:, 1], size - corners[:, 0]], axis=1)
+        vectors = np.stack([vectors[:, 1], -vectors[:, 0]], axis=1)
+    return Sample(
+        *(image(a) for a in sample[:5]),
+        corners,
+        sample.corner_heights,
+        image(sample.corners_known),
+        np.concatenate([vectors.ravel(), sample.geometry[4:]]).astype(np.float32),
+    )
+
+
+def upright(sample: Sample, rng: np.random.Generator) -> Sample:
+    """The sample as the network sees tiles (`runtime.upright`): roofs lean up. Where nothing leans, any of its eight views."""
+    turn = int(rng.integers(8))
+    if not sample.geometry[:2].any():
+        return dihedral(sample, turn)
+    return next(s for s in (dihedral(sample, k) for k in range(8)) if runtime.leans_up(*s.geometry[:2]))
+
+
+def without_geometry(sample: Sample, rng: np.random.Generator, share: float = FORGOTTEN) -> Sample:
+    """Forgets now the view, now the sun, so that a network learns to do without."""
+    geometry = sample.geometry.copy()
+    for vector, flag in ((slice(0, 2), 4), (slice(2, 4), 5)):
+        if rng.random() < share:
+            geometry[vector] = 0
+            geometry[flag] = 0
+    return sample._replace(geometry=geometry)
+
+
+def radiometry(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Another sensor, stretch and weather over the same scene, uint8 (h, w, 3)."""
+    x = rgb.astype(np.float32) / 255
+    rows, cols = rgb.shape[:2]
+    if rng.random() < 0.4:  # coarser pixels drawn larger, as pansharpened and resampled imagery is
+        factor = rng.uniform(1.0, 1.7)
+        small = cv2.resize(x, (round(cols / factor), round(rows / factor)), interpolation=cv2.INTER_AREA)
+        x = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC if rng.random() < 0.5 else cv2.INTER_LINEAR)
+    if rng.random() < 0.3:
+        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 1.0))
+    if rng.random() < 0.25:  # colours coarser than brightness, as after pansharpening
+        grey = x.mean(2, keepdims=True)
+        x = grey + cv2.GaussianBlur(x - grey, (0, 0), rng.uniform(0.8, 2.5))
+    if rng.random() < 0.25:  # sharpened by the vendor
+        x = x + rng.uniform(0.2, 1.0) * (x - cv2.GaussianBlur(x, (0, 0), 1.0))
+    grey = x.mean(2, keepdims=True)
+    saturation = rng.uniform(0.0, 0.4) if rng.random() < 0.12 else np.exp(rng.normal(0, 0.3))
+    x = grey + saturation * (x - grey)
+    if rng.random() < 0.4:  # hue: mix the bands a little
+        mix = np.eye(3) + rng.normal(0, 0.08, (3, 3))
+        x = x @ (mix / mix.sum(1, keepdims=True)).T.astype(np.float32)
+    x = x * np.exp(rng.normal(0, 0.1, 3)).astype(np.float32)
+    low, high = np.percentile(x[::4, ::4], [1, 99])
+    if rng.random() < 0.5 and high > low + 0.05:  # stretched to its own range, as rasters for viewing are
+        x = (x - low) / (high - low) * rng.uniform(0.7, 1.05) + rng.uniform(-0.03, 0.12)
+    x = np.clip(x, 0, 1) ** np.exp(rng.normal(0, 0.35))
+    x = 0.5 + np.exp(rng.normal(0, 0.2)) * (x - 0.5) + rng.normal(0, 0.07)
+    if rng.random() < 0.2:  # haze
+        veil = rng.uniform(0.05, 0.35)
+        x = (1 - veil) * x + veil * rng.uniform(0.6, 0.9, 3)
+    if rng.random() < 0.6:
+        x = x + rng.normal(0, rng.uniform(0.003, 0.035), x.shape)
+    out = (np.clip(x, 0, 1) * 255).astype(np.uint8)
+    if rng.random() < 0.25:
+        coded = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 95))])[1]
+        out = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(out, dtype=np.uint8)
+
+
+def repainted(sample: Sample, rng: np.random.Generator) -> Sample:
+    """The same roofs, building by building of other brightness and colour: black slate, weathered tiles.
+
+    Faces keep their shading to each other. Most get darker: dark roofs beside bright yards are what satellites show and
+    photographs of well-lit suburbs do not.
+    """
+    count, buildings = cv2.connectedComponents((sample.labels > 0).astype(np.uint8), connectivity=4)
+    street = rng.uniform(-1.3, 0.4)  # log of the gain: neighbours are alike
+    gains = np.exp(street + rng.normal(0, 0.25, (count, 1)) + rng.normal(0, 0.06, (count, 3)))
+    greyed = np.clip(rng.uniform(-0.5, 0.9) + rng.normal(0, 0.15, count), 0, 1)
+    gains[0], greyed[0] = 1.0, 0.0
+    rim = rng.uniform(0.5, 1.5)  # px: as the rims of the picture are mixed
+    gain = cv2.GaussianBlur(gains[buildings].astype(np.float32), (0, 0), rim)
+    share = cv2.GaussianBlur(greyed[buildings].astype(np.float32), (0, 0), rim)[..., None]
+    rgb = sample.rgb.astype(np.float32)
+    rgb = gain * (rgb + share * (rgb.mean(axis=2, keepdims=True) - rgb))
+    return sample._replace(rgb=np.clip(np.rint(rgb), 0, 255).astype(np.uint8))
