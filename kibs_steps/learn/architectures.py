@@ -196,17 +196,18 @@ class Sweep(nn.Module):
         """(n, 2·H·c, h/block, w/block): features at the base for each of H heights, then at the shadow's tip; zero outside."""
         n, _, h, w = features.shape
         rows, cols = h // self.block, w // self.block
-        heights = torch.tensor(SWEPT, dtype=features.dtype, device=features.device)
+        kind = {"dtype": features.dtype, "device": features.device}
+        heights = torch.tensor(SWEPT, **kind)
+        scale = torch.tensor([2.0 / w, 2.0 / h], **kind)  # of a cell, where the map goes from −1 to 1
         view, sun = geometry[:, 0:2], geometry[:, 2:4]
         steps = (
-            torch.stack([-view, sun - view], dim=1) / self.stride
-        )  # (n, 2, 2) cells per metre: to the base, to the tip
+            torch.stack([-view, sun - view], dim=1) / self.stride * scale
+        )  # (n, 2, 2) per metre: to the base, to the tip
         shift = (steps[:, :, None] * heights[None, None, :, None]).reshape(n, 2 * len(SWEPT), 1, 1, 2)
-        col = (torch.arange(cols, dtype=features.dtype, device=features.device) + 0.5) * self.block
-        row = (torch.arange(rows, dtype=features.dtype, device=features.device) + 0.5) * self.block
-        at = torch.stack([col[None, :].expand(rows, cols), row[:, None].expand(rows, cols)], dim=-1)[None, None] + shift
-        scale = torch.tensor([2.0 / w, 2.0 / h], dtype=features.dtype, device=features.device)
-        read = F.grid_sample(features, (at * scale - 1).reshape(n, -1, cols, 2), align_corners=False)
+        col = (torch.arange(cols, **kind) + 0.5) * (self.block * 2.0 / w) - 1
+        row = (torch.arange(rows, **kind) + 0.5) * (self.block * 2.0 / h) - 1
+        place = torch.stack([col[None, :].expand(rows, cols), row[:, None].expand(rows, cols)], dim=-1)[None, None]
+        read = F.grid_sample(features, (place + shift).reshape(n, -1, cols, 2), align_corners=False)
         return read.reshape(n, -1, rows, cols)
 
 
@@ -233,7 +234,7 @@ class Heights(nn.Module):
         self, features: torch.Tensor, finer: torch.Tensor, surface: torch.Tensor, geometry: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """`features` at stride 4; `finer` and `surface` (logits of the kinds) at stride 2."""
-        seen = torch.cat([self.reduce(finer), torch.softmax(surface, dim=1)], dim=1)
+        seen = torch.cat([self.reduce(finer), softmax(surface)], dim=1)
         x4 = F.relu(self.entered(self.gather(self.sweep(seen, geometry)) + self.enter(features)))
         x8 = self.down[0](F.max_pool2d(x4, 2))
         x = self.middle(self.down[1](F.max_pool2d(x8, 2)))
@@ -299,8 +300,7 @@ class Dense(nn.Module):
             if i == 1:
                 stride_4 = x
         x = self.refine(x)
-        maps = torch.split(self.maps(x), list(CHANNELS.values()), dim=1)
-        raw = dict(zip(CHANNELS, maps, strict=True))
+        raw = self.full_maps(x)
         raw["surface"] = self.surface(x)
         if self.task != "sections":
             raw["height"], raw["slope"] = self.heights(stride_4, x, raw["surface"], geometry)
@@ -308,11 +308,27 @@ class Dense(nn.Module):
             raw = {name: resized(x, 1 / self.zoom) for name, x in raw.items()}
         return raw
 
+    def full_maps(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The maps at stride 1 that the task asks for, from features at stride 2: the rest would cost a tenth more."""
+        names = [name for name in CHANNELS if name in OUTPUTS[self.task]]
+        before = sum(CHANNELS[name] for name in list(CHANNELS)[: list(CHANNELS).index(names[0])])
+        channels = [CHANNELS[name] for name in names]
+        conv, shuffle = self.maps
+        part = slice(4 * before, 4 * (before + sum(channels)))
+        maps = shuffle(F.conv2d(x, conv.weight[part], conv.bias[part]))
+        return dict(zip(names, torch.split(maps, channels, dim=1), strict=True))
+
     def forward(self, image: torch.Tensor, geometry: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Probabilities in the order of OUTPUTS[task]: the exported graph."""
         raw = self.logits(image, geometry)
-        final = {"offset": lambda x: 0.5 * torch.tanh(x), "height": lambda x: torch.softmax(x, dim=1)}
+        final = {"offset": lambda x: 0.5 * torch.tanh(x), "height": softmax}
         return tuple(final.get(name, torch.sigmoid)(raw[name]) for name in OUTPUTS[self.task])
+
+
+def softmax(maps: torch.Tensor) -> torch.Tensor:
+    """Softmax over the channels of maps (n, c, h, w), written out: onnxruntime's own turns the maps over and back."""
+    risen = torch.exp(maps - maps.amax(dim=1, keepdim=True))
+    return risen / risen.sum(dim=1, keepdim=True)
 
 
 def resized(maps: torch.Tensor, factor: float) -> torch.Tensor:

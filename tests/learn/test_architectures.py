@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="networks need the extra `learn` (torch)")
 
 from kibs_steps.learn import training  # noqa: E402
-from kibs_steps.learn.architectures import SWEPT, Sweep  # noqa: E402
+from kibs_steps.learn.architectures import OUTPUTS, SWEPT, Sweep, softmax  # noqa: E402
 
 
 @pytest.mark.parametrize(("stride", "block"), [(4, 1), (2, 2)])
@@ -45,6 +45,25 @@ def test_a_zoomed_network_is_the_same_network_on_a_larger_image():
     for name in ("roof", "edge", "distance"):
         smaller = torch.nn.functional.interpolate(expected[name], size=(64, 64), mode="bilinear")
         assert torch.allclose(raw[name], smaller, atol=1e-5)
+
+
+@pytest.mark.parametrize("task", ["sections", "corners"])
+def test_a_network_of_one_task_gives_its_maps_of_a_network_of_both(task):
+    torch.manual_seed(0)
+    both, one = training.network("both").eval(), training.network(task).eval()
+    one.load_state_dict(both.state_dict())
+    image, geometry = torch.rand(1, 3, 64, 64), torch.tensor([[0.2, -1.4, 0.6, 0.3, 1.0, 1.0]])
+    with torch.no_grad():
+        expected = dict(zip(OUTPUTS["both"], both(image, geometry), strict=True))
+        found = dict(zip(OUTPUTS[task], one(image, geometry), strict=True))
+    for name, value in found.items():
+        assert torch.allclose(value, expected[name], atol=1e-6), name
+        assert value.std() > 0, name
+
+
+def test_softmax_is_torch_s_even_far_from_zero():
+    maps = 200 * torch.randn(2, 5, 8, 8, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(softmax(maps), torch.softmax(maps, dim=1), atol=1e-6)
 
 
 def test_all_of_the_encoder_learns():
