@@ -200,9 +200,8 @@ class Sweep(nn.Module):
         heights = torch.tensor(SWEPT, **kind)
         scale = torch.tensor([2.0 / w, 2.0 / h], **kind)  # of a cell, where the map goes from −1 to 1
         view, sun = geometry[:, 0:2], geometry[:, 2:4]
-        steps = (
-            torch.stack([-view, sun - view], dim=1) / self.stride * scale
-        )  # (n, 2, 2) per metre: to the base, to the tip
+        # (n, 2, 2) per metre of height: to the base, to the shadow's tip
+        steps = torch.stack([-view, sun - view], dim=1) / self.stride * scale
         shift = (steps[:, :, None] * heights[None, None, :, None]).reshape(n, 2 * len(SWEPT), 1, 1, 2)
         col = (torch.arange(cols, **kind) + 0.5) * (self.block * 2.0 / w) - 1
         row = (torch.arange(rows, **kind) + 0.5) * (self.block * 2.0 / h) - 1
@@ -309,7 +308,7 @@ class Dense(nn.Module):
         return raw
 
     def full_maps(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
-        """The maps at stride 1 that the task asks for, from features at stride 2: the rest would cost a tenth more."""
+        """The maps at stride 1 that the task asks for, from features at stride 2; those of the other task cost time."""
         names = [name for name in CHANNELS if name in OUTPUTS[self.task]]
         before = sum(CHANNELS[name] for name in list(CHANNELS)[: list(CHANNELS).index(names[0])])
         channels = [CHANNELS[name] for name in names]

@@ -219,7 +219,7 @@ class Mixture:
     `shares` are the probabilities of (simulated, pasted houses, chips, own). Simulated tiles come from `pool`, a folder of
     kept samples that another process may still be filling; while it is empty, the other sources stand in. `own` are files of
     kept samples (`learn.own`), as those at `gsd`. The share `forget` comes without view, and without sun. Tiles come `upright`,
-    or turned at random.
+    or turned at random; some have their roofs repainted, some their radiometry changed.
     """
 
     def __init__(
@@ -270,8 +270,6 @@ class Mixture:
         sample = (
             augmentation.upright(sample, rng) if self.upright else augmentation.dihedral(sample, int(rng.integers(8)))
         )
-        return (
-            sample
-            if rng.random() < augmentation.AS_IT_IS
-            else sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
-        )
+        if rng.random() >= augmentation.AS_IT_IS:
+            sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
+        return sample
