@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 
-from kibs_steps import cli, heightmap, raster, scene, sections, store
+from kibs_steps import cli, heightmap, raster, scene, sections, store, supposed
 from kibs_steps.grid import Tile, Tiling
 
 if TYPE_CHECKING:
@@ -78,6 +78,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--name", required=True, help="block name")
     parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--supposed", help="supposed.json, where view or sun is not known")
     runtime.add_options(parser)
     parser.add_argument("--out", required=True, help="out: corners.parquet")
     parser.add_argument("--heights", required=True, help="out: heights.parquet")
@@ -89,9 +90,8 @@ def main(argv: list[str] | None = None) -> None:
     tiles = tiling.tiles(block, facts.grid.width, facts.grid.height)
     labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
     images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
-    seen = facts.view_of(tiling.block_core(block, facts.grid.width, facts.grid.height))
-    geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
-    network = runtime.open_network(model, geometry, args.provider, args.threads)
+    core = tiling.block_core(block, facts.grid.width, facts.grid.height)
+    network = runtime.open_network(model, supposed.told(facts, core, args.supposed), args.provider, args.threads)
     tables, heights = [CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile in tiles:
         place = tile.row, tile.col

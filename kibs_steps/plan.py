@@ -37,6 +37,7 @@ DEFAULTS = {
     "threads": 1,
     "lod_label": "2.0",
     "drape": False,
+    "suppose": True,
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
 TASKS = {"two_stage": ("sections", "corners"), "single": ("both",)}
@@ -85,6 +86,11 @@ class Plan(NamedTuple):
     def blocks_read(self, copy: str) -> str:
         """The raster that blocks read: `copy` (a path) where the raster's own layout is too slow."""
         return copy if self.settings.get("simulate") is None and tiled.needed(self.raster) else self.raster
+
+    @property
+    def supposes(self) -> bool:
+        """Whether the networks are told directions that the image looks like."""
+        return supposes(self.settings, self.models)
 
     @property
     def seam_rule(self) -> str:
@@ -236,6 +242,14 @@ def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) 
     return list(dict.fromkeys(warning for warnings in found for warning in warnings))
 
 
+def supposes(settings: dict[str, Any], models: dict[str, contract.Model]) -> bool:
+    """Whether the networks are told directions that the image looks like: where the 2D model can say, and nobody else did."""
+    unknown = None in (direction(settings, "view"), direction(settings, "sun")) and not settings.get("regions")
+    terms = models["sections"].contract
+    can = terms["head"] == "dense" and bool(terms.get("geometry_input"))
+    return bool(settings["suppose"]) and settings["feed"] == "models" and unknown and can
+
+
 def folder_of(models: str, base: Path) -> Path:
     """The folder of a model set: a name under `models/`, or a path."""
     named = base / "models" / models
@@ -275,7 +289,7 @@ def signatures(
         return fingerprint.of_file(value, cache) if value and Path(value).is_file() else value
 
     angles = [some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"), content("regions")]
-    seen = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
+    seen: dict[str, Any] = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
     s = {"source": h(version("kibs-steps"), source)}
     s["scene"] = h(
         s["source"],
@@ -289,6 +303,9 @@ def signatures(
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
     inference = some("provider", "threads")  # sums in another order differ in their last bits
+    s["supposed"] = h(s["tiles"], models["sections"].sha256, angles, inference)
+    if supposes(settings, models):
+        seen = {task: told and [told, s["supposed"]] for task, told in seen.items()}
     s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"], inference)
     s["blend"] = h(s["sections"], models["corners"].sha256)
     s["corners"] = h(s["blend"], seen["corners"], inference)

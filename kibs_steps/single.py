@@ -14,7 +14,7 @@ import argparse
 import numpy as np
 import pyarrow as pa
 
-from kibs_steps import cli, corners, heightmap, raster, scene, sections, store
+from kibs_steps import cli, corners, heightmap, raster, scene, sections, store, supposed
 from kibs_steps.grid import Block, Grid, Tiling
 from kibs_steps.models import heads, runtime
 
@@ -52,6 +52,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--name", required=True, help="block name")
     parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--supposed", help="supposed.json, where view or sun is not known")
     runtime.add_options(parser)
     parser.add_argument(
         "--seam-rule", choices=sections.SEAM_RULES, default="overlap", help="which pieces are one section"
@@ -70,9 +71,7 @@ def main(argv: list[str] | None = None) -> None:
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
-    seen = facts.view_of(core)
-    geometry = runtime.geometry_vector(seen and seen.lean, facts.sun and facts.sun.lean, facts.grid.gsd)
-    network = runtime.open_network(model, geometry, args.provider, args.threads)
+    network = runtime.open_network(model, supposed.told(facts, core, args.supposed), args.provider, args.threads)
     views, table, heights = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
     clear = valid & ~sections.burnt_out(rgb, valid, views, tiling, core)
     sections.write(views, clear, tiling, core, args.seam_rule, args)

@@ -164,11 +164,12 @@ def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
     return Joined(number, groups(len(order), link), stands, row)
 
 
-def united(pieces: Parts, weights: dict[str, float] | None = None) -> Parts:
+def united(pieces: Parts, weights: dict[str, float] | None = None, sure: float = 0.0) -> Parts:
     """Sections from pieces in order of number: the union of every group, then one section per connected part.
 
     Scores are those of the pieces' evidence together, by the `weights` of the model; without evidence means weighted by area.
-    Every part of a group has the score and the sums of heights of the whole.
+    Every part of a group has the score and the sums of heights of the whole. What is no roof by all its evidence (`sure` is the
+    least mean roof probability) is left out.
     """
     order = np.argsort(pieces.group, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(pieces.group[order]) != 0]) if len(order) else np.zeros(0, int)
@@ -194,7 +195,8 @@ def united(pieces: Parts, weights: dict[str, float] | None = None) -> Parts:
     told = evidence[:, 0] > 0
     score = np.where(told, scoring.scores(evidence, weights), score)
     none = np.zeros(len(rows), np.int64)
-    return Parts(none, none, shapely.normalize(geometry), score, void, split, owner, evidence, sums)
+    found = Parts(none, none, shapely.normalize(geometry), score, void, split, owner, evidence, sums)
+    return found.take(scoring.sure(evidence, sure))
 
 
 def of_pieces(labels: np.ndarray, heights: pa.Table) -> np.ndarray:
@@ -320,6 +322,7 @@ def sweep(
     tolerance: float,
     rule: str,
     weights: dict[str, float] | None,
+    sure: float,
 ) -> Iterator[tuple[int, pa.Table]]:
     """The sections of each row of blocks (table after `SECTIONS`, by id), row after row."""
     whole = joined(blocks, found, rule)
@@ -348,7 +351,7 @@ def sweep(
 
             split = scan_order.first_come(complete.geometry, complete.group, complete.split)
             complete = complete._replace(split=split)
-        open_ = Parts.joined([open_, united(complete, weights)])
+        open_ = Parts.joined([open_, united(complete, weights, sure)])
         limit = (row + 1) * side
         leaves = np.ones(len(open_.group), bool)
         if tolerance > 0 and row != rows[-1]:
@@ -380,15 +383,16 @@ def stitch(
     reach: float,
     rule: str = "overlap",
     weights: dict[str, float] | None = None,
+    sure: float = 0.0,
 ) -> Iterator[tuple[Block, pa.Table, pa.Table]]:
     """Every block, row by row, with its sections and corners (tables after `SECTIONS` and `corners.CORNERS`).
 
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
     corners may lie; `rule` as in `sections.links_across`: by `touch` the first piece in scan order also gives the split.
-    `weights` are the model's for scores (`models.scoring`).
+    `weights` are the model's for scores, `sure` is its least mean roof probability of a section (`models.scoring`).
     """
     corners = distinct_corners(pa.concat_tables([CORNERS.empty_table(), *(found.corners(b) for b in blocks)]))
-    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule, weights):
+    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule, weights, sure):
         of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 1]
         for block in sorted((b for b in blocks if b.row == row), key=lambda b: b.col):
             mine = table.filter(pa.array(of == block.col))
@@ -430,7 +434,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--seam-rule", choices=SEAM_RULES, default="overlap", help="which pieces are one section")
     parser.add_argument("--folders", nargs="+", required=True, help="detections: folders in the blocks' folders")
-    parser.add_argument("--model", help="models/sections.json, for scores")
+    parser.add_argument("--model", help="models/sections.json, for scores and what is sure")
     parser.add_argument("--without-corners", action="store_true", help="no corners were looked for")
     parser.add_argument("--with-heights", action="store_true", help="a model gave heights all over the sections")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
@@ -454,9 +458,15 @@ def main(argv: list[str] | None = None) -> None:
     )
     blocks = [tiling.block_of(name) for name in folders]
     missing = missing_areas(blocks, facts.grid, tiling)
-    weights = store.read_json(args.model)["contract"].get("score") if args.model else None
+    terms = store.read_json(args.model)["contract"] if args.model else {"thresholds": {}}
     with store.by_block(args.sections, SECTIONS) as sections, store.by_block(args.corners, CORNERS) as corners:
-        settings = (args.tolerance, args.reach, args.seam_rule, weights)
+        settings = (
+            args.tolerance,
+            args.reach,
+            args.seam_rule,
+            terms.get("score"),
+            terms["thresholds"].get("sure", 0.0),
+        )
         for block, mine, near in stitch(blocks, found, facts.grid, tiling, *settings):
             sections(block.name, cut_by(mine, missing))
             corners(block.name, near)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from kibs_steps import corners, heightmap, sections, stitch
 from kibs_steps.grid import Grid, Tiling, Window
-from kibs_steps.models import contract, heads, runtime
+from kibs_steps.models import contract, heads, runtime, scoring
 
 WIDTH, HEIGHT = 300, 230
 
@@ -93,6 +93,26 @@ def test_scores_are_of_whole_sections(world):
     table, _ = detections(image, 2, nets, weights=weights)
     area = shapely.area(shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False)))
     np.testing.assert_allclose(table["score"].to_numpy(), 1 / (1 + np.exp(3.0) / area), rtol=1e-5)
+
+
+def test_what_is_sure_is_asked_of_whole_sections():
+    """A section stays whole though one of its parts alone would be too faint; what nothing is told of stays."""
+    boxes = [
+        shapely.box(0, 0, 4, 10),
+        shapely.box(4, 0, 16, 10),
+        shapely.box(40, 0, 50, 10),
+        shapely.box(60, 0, 70, 10),
+    ]
+    area, roof = np.array([40.0, 120.0, 100.0, 0.0]), np.array([0.5, 0.8, 0.55, 0.0])
+    evidence = scoring.none(4)
+    evidence[:, scoring.EVIDENCE.index("area")] = area
+    evidence[:, scoring.EVIDENCE.index("roof")] = area * roof
+    none = np.zeros(4, np.int64)
+    heights = np.zeros((4, len(heightmap.SUMS)))
+    group = np.array([0, 0, 1, 2])
+    pieces = stitch.Parts(none, group, np.array(boxes), np.full(4, 0.5), none > 0, none, none, evidence, heights)
+    assert shapely.area(stitch.united(pieces, sure=0.6).geometry).tolist() == [160, 100]
+    assert len(stitch.united(pieces).geometry) == 3
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1.5])

@@ -18,6 +18,7 @@ from kibs_steps import cli, store
 from kibs_steps.learn import export, training, validation
 from kibs_steps.learn.samples import Sample
 from kibs_steps.models import contract as contracts
+from kibs_steps.models import heads
 
 
 class Ablation(NamedTuple):
@@ -73,8 +74,8 @@ def judge(run: Ablation, models: dict[str, contracts.Model], sets: dict[str, lis
         thresholds, score = validation.best_decoding(shown, model.contract)
         chosen = {**model.contract, "thresholds": {**model.contract["thresholds"], **thresholds}, "score": score}
         for name, samples in sets.items():
-            found = [validation.heads.decode_sections(maps, chosen) for maps in raw[name]]
-            figures = validation.judge_sections(raw[name], found, samples, thresholds["roof"])
+            found = [heads.alone(heads.decode_sections(maps, chosen), maps, chosen) for maps in raw[name]]
+            figures = validation.judge_sections(found, samples)
             rows.append({"run": run.name, "as": AS["sections"], "set": name, **figures})
     for task in ("corners", "both"):
         if task in models:

@@ -103,16 +103,17 @@ class Runner:
         rgb = np.pad(sample.rgb, ((before, rest), (before, rest), (0, 0)), mode="symmetric")
         networks = self.networks(sample.geometry)
         start = time.process_time()  # of one thread: what else runs on the machine does not count
-        outputs = networks["sections"](rgb)
-        found = heads.decode_sections(outputs, models["sections"].contract)
+        sections = outputs = networks["sections"](rgb)
+        found = heads.decode_sections(sections, models["sections"].contract)
         if models["sections"] is not models["corners"]:
             outputs = networks["corners"](blend(rgb, found.labels, **models["corners"].contract["blend"]))
         corners = heads.decode_corners(outputs, models["corners"].contract)
         self.seconds += time.process_time() - start
         self.tiles += 1
         place = np.column_stack([corners.col, corners.row]) - before
-        labels = found.labels[before : before + SIDE, before : before + SIDE]
-        return Found(labels, found.scores, place[((place >= 0) & (place < SIDE)).all(axis=1)])
+        judged = heads.alone(found, sections, models["sections"].contract)
+        labels = judged.labels[before : before + SIDE, before : before + SIDE]
+        return Found(labels, judged.scores, place[((place >= 0) & (place < SIDE)).all(axis=1)])
 
 
 def figures(samples: Sequence[Sample], found: Sequence[Found]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from kibs_steps.simulate.draped import House
 
 GSD = 0.38  # m per px of the models trained here, if no other is asked for
-LOOSE = 5  # px, width of the strip about a mask's outline of which nothing is asked
+LOOSE = 3  # px, width of the strip about a mask's outline of which nothing is asked
 NADIR = np.array([0, 0, 0, 0, 1, 0], np.float32)
 
 

@@ -23,7 +23,7 @@ from kibs_steps.models import contract as contracts
 
 TILE, MARGIN = 512, 32  # px at dataset.GSD
 THRESHOLDS = {
-    "sections": {"roof": 0.5, "prominence": 0.2, "min_area": 12},
+    "sections": {"roof": 0.5, "prominence": 0.2, "min_area": 12, "sure": 0.6},
     "corners": {"corner": 0.3, "corner_radius": 7.5},
 }
 THRESHOLDS["both"] = THRESHOLDS["sections"] | THRESHOLDS["corners"]

@@ -75,7 +75,16 @@ def network(task: str, backbone: str = "resnet50", proposals: int = 1000, detect
         box_score_thresh=LOWEST_SCORE,
     )
     model.transform = OwnSize(TILE, TILE, [0.0] * 3, [1.0] * 3)
+    for part in (model.rpn.head, model.roi_heads.box_predictor, model.roi_heads.mask_predictor):
+        part.register_forward_hook(_in_full)
     return model
+
+
+def _in_full(part: nn.Module, given: Any, output: Any) -> Any:
+    """A part's output in float32: torchvision reckons boxes in its type, and in bfloat16 a pixel at 230 is lost in rounding."""
+    if isinstance(output, torch.Tensor):
+        return output.float()
+    return type(output)(_in_full(part, given, value) for value in output)
 
 
 def example(sample: Sample, task: str, labels: np.ndarray) -> dict[str, Any]:

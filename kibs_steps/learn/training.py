@@ -71,16 +71,23 @@ class Onwards(torch.utils.data.Sampler):
         return iter(range(self.start, 2**31))
 
 
+def brief(device: str) -> torch.autocast:
+    """Networks in bfloat16 where the machine is quick at it; elsewhere it is several times slower than float32."""
+    return torch.autocast(device, torch.bfloat16, enabled=device == "cuda" or torch.cpu._is_avx512_bf16_supported())
+
+
 def dense_terms(model: Dense, batch: Batch) -> Batch:
-    """All loss terms of a batch, the network in bfloat16 where the machine is quick at it."""
-    device = batch["image"].device.type
-    quick = (
-        device == "cuda" or torch.cpu._is_avx512_bf16_supported()
-    )  # elsewhere it is several times slower than float32
+    """All loss terms of a batch for a dense network."""
     image = normalised(batch["image"]).contiguous(memory_format=torch.channels_last)
-    with torch.autocast(device, torch.bfloat16, enabled=quick):
+    with brief(image.device.type):
         raw = model.logits(image, batch["geometry"])
     return losses({k: v.float() for k, v in raw.items()}, batch, model.task)
+
+
+def instance_terms(model: nn.Module, batch: dict[str, Any]) -> Batch:
+    """All loss terms of a batch for a Mask R-CNN."""
+    with brief(batch["image"].device.type):
+        return {name: value.float() for name, value in maskrcnn.loss_terms(model, batch).items()}
 
 
 def network(task: str = "both", family: str = "dense", zoom: float = 1.0) -> nn.Module:
@@ -169,7 +176,7 @@ def train(
     path = out / "checkpoint.pt"
     torch.manual_seed(settings.seed)
     is_dense = settings.family == "dense"
-    terms_of = dense_terms if is_dense else maskrcnn.loss_terms
+    terms_of = dense_terms if is_dense else instance_terms
     collate = torch.utils.data.default_collate if is_dense else maskrcnn.collated
     where = torch.device(device)
     model = model.to(where, memory_format=torch.channels_last).train()

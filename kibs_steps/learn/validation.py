@@ -168,16 +168,14 @@ def raw_sections(model: contracts.Model, samples: Sequence[Sample]) -> list[dict
 
 
 def judge_sections(
-    raw: Sequence[dict[str, np.ndarray]],
     found: Sequence[heads.Sections],
     samples: Sequence[Sample],
-    roof: float,
 ) -> dict[str, float]:
-    """Roof IoU at the threshold `roof`, AP at overlaps 0.5 and 0.75, true and found sections."""
+    """Roof IoU of all sections together, AP at overlaps 0.5 and 0.75, true and found sections."""
     results = [matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True)]
     strict = [matches(f.labels, f.scores, s.labels, 0.75) for f, s in zip(found, samples, strict=True)]
     return {
-        "roof_iou": roof_iou((r["roof"][0] > roof, s.roof) for r, s in zip(raw, samples, strict=True)),
+        "roof_iou": roof_iou((f.labels > 0, s.roof) for f, s in zip(found, samples, strict=True)),
         "ap50": average_precision(results),
         "ap75": average_precision(strict),
         "truths": sum(r.truths for r in results),
@@ -308,8 +306,8 @@ def main(argv: list[str] | None = None) -> None:
         print(report["thresholds"], report["score"])
     for name, samples in sets.items():
         raw = raw_maps[name]
-        found = [heads.decode_sections(maps, model.contract) for maps in raw]
-        report[name] = judge_sections(raw, found, samples, model.contract["thresholds"]["roof"])
+        found = [heads.alone(heads.decode_sections(maps, model.contract), maps, model.contract) for maps in raw]
+        report[name] = judge_sections(found, samples)
         if corner_model and name.startswith("simulated"):
             report[name]["corners"] = judge_corners(corner_model, samples, [f.labels for f in found])
             report[name]["corners_true_sections"] = judge_corners(corner_model, samples, [s.labels for s in samples])

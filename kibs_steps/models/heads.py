@@ -44,6 +44,21 @@ def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any]) ->
     return instance_sections(outputs, contract["tile"], contract["thresholds"])
 
 
+def alone(found: Sections, outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Sections:
+    """Sections of a tile that is looked at alone: without those below `thresholds.sure`, numbered anew.
+
+    Where tiles are stitched that is asked of whole sections.
+    """
+    if contract["head"] != "dense" or "sure" not in contract["thresholds"]:
+        return found
+    maps = (outputs[name][0] for name in ("roof", "edge", "distance"))
+    stays = scoring.sure(
+        scoring.evidence(found.labels, rims(found.labels), *maps, n=len(found.scores)), contract["thresholds"]["sure"]
+    )
+    number = np.append(0, np.where(stays, np.cumsum(stays), 0)).astype(np.int32)
+    return Sections(number[found.labels], found.scores[stays])
+
+
 def decode_corners(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Corners:
     """Corners of one tile from the outputs of either head."""
     if contract["head"] == "dense":

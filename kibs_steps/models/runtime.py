@@ -64,11 +64,17 @@ def geometry_vector(view: tuple[float, float] | None, sun: tuple[float, float] |
 
 
 def open_network(model: contracts.Model, geometry: np.ndarray, provider: str = "cpu", threads: int = 1) -> Network:
-    """A function from an image (s, s, 3) uint8 to the model's named outputs without their batch axis.
+    """The network of a model for one geometry (1, 6), as `opened` gives them."""
+    return opened(model, provider, threads)(geometry)
+
+
+def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> Callable[[np.ndarray], Network]:
+    """A session of a model: for a geometry (1, 6) a function from an image (s, s, 3) uint8 to the model's named outputs without
+    their batch axis.
 
     Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged; those
     that want tiles `upright` see the one view in which roofs lean up, where the lean is known and not zero.
-    `geometry` (1, 6) goes to models whose contract asks for it. `provider` is a key of `PROVIDERS`; `threads` within an
+    The geometry goes to models whose contract asks for it. `provider` is a key of `PROVIDERS`; `threads` within an
     operator. Raises `ProviderMissing`.
     """
     import onnxruntime as ort
@@ -101,19 +107,22 @@ def open_network(model: contracts.Model, geometry: np.ndarray, provider: str = "
         outputs = session.run(names, feed)
         return {name: (value[0] if dense else value) for name, value in zip(names, outputs, strict=True)}
 
-    if not dense:
-        return lambda rgb: run(rgb, geometry)
-    leans = bool(model.contract.get("upright")) and bool(geometry[0, :2].any())
-    views = [upright(geometry)] if leans else FLIPS[: model.contract.get("flips", 1)]
+    def told(geometry: np.ndarray) -> Network:
+        if not dense:
+            return lambda rgb: run(rgb, geometry)
+        leans = bool(model.contract.get("upright")) and bool(geometry[0, :2].any())
+        views = [upright(geometry)] if leans else FLIPS[: model.contract.get("flips", 1)]
 
-    def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
-        total: dict[str, np.ndarray] = {}
-        for flip in views:
-            for name, value in flip.back(run(flip.image(rgb), flip.geometry(geometry))).items():
-                total[name] = total[name] + value if name in total else value
-        return {name: value / np.float32(len(views)) for name, value in total.items()} if len(views) > 1 else total
+        def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
+            total: dict[str, np.ndarray] = {}
+            for flip in views:
+                for name, value in flip.back(run(flip.image(rgb), flip.geometry(geometry))).items():
+                    total[name] = total[name] + value if name in total else value
+            return {name: value / np.float32(len(views)) for name, value in total.items()} if len(views) > 1 else total
 
-    return network
+        return network
+
+    return told
 
 
 class Flip(NamedTuple):

@@ -54,6 +54,11 @@ def traits(found: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def sure(found: np.ndarray, least: float) -> np.ndarray:
+    """Which sections (n,) bool are roofs by their `evidence` (n, 6): of a mean roof probability of `least`, or nothing told."""
+    return (found[:, 0] == 0) | (traits(found)["roof"] >= least)
+
+
 def scores(found: np.ndarray, score: dict[str, float] | None) -> np.ndarray:
     """How likely sections are right (n,) float32, from their `evidence` and the contract's weights of `traits`; without weights
     their mean roof probability."""

@@ -105,7 +105,9 @@ def random_scene(
     seen_from = _direction(*(view or _random_view(rng, *view_elevation)))
     lit_from = _direction(*(sun or (rng.uniform(0, 360), rng.uniform(*sun_elevation))))
     style = style or str(
-        rng.choice([*STYLES, "mixed", "town"], p=[0.17, 0.13, 0.1, 0.11, 0.09, 0.08, 0.02, 0.05, 0.05, 0.03, 0.1, 0.07])
+        rng.choice(
+            [*STYLES, "mixed", "town"], p=[0.13, 0.12, 0.09, 0.17, 0.15, 0.07, 0.02, 0.04, 0.05, 0.02, 0.08, 0.06]
+        )
     )
     model = pick(rng, cities) if len(cities) and rng.random() < city_share else None
     # Tall buildings outside lean into the tile.

@@ -36,6 +36,21 @@ def test_adjacent_sections_come_back_apart():
     np.testing.assert_allclose(found.scores, 1)
 
 
+def test_a_tile_alone_is_without_what_is_not_sure():
+    labels = np.zeros((64, 64), int)
+    labels[8:20, 10:40], labels[30:50, 10:40], labels[55:60, 50:60] = 1, 2, 3
+    roof, edge, distance = ideal_maps(labels)
+    roof[labels == 2] = 0.55
+    outputs = {"roof": roof[None], "edge": edge[None], "distance": distance[None]}
+    contract = {"head": "dense", "thresholds": THRESHOLDS}
+    every = heads.decode_sections(outputs, contract)
+    assert heads.alone(every, outputs, contract) is every
+    left = heads.alone(every, outputs, {**contract, "thresholds": {**THRESHOLDS, "sure": 0.6}})
+    np.testing.assert_array_equal(left.labels > 0, (labels == 1) | (labels == 3))
+    assert sorted(np.unique(left.labels)) == [0, 1, 2]
+    assert left.scores.shape == (2,)
+
+
 def test_a_summit_counts_by_its_rise_above_the_pass():
     """Two summits of 1 and 0.8 with a pass of 0.5 between them: two sections below a prominence of 0.3, one above it."""
     level = np.full((3, 9), 0.5)

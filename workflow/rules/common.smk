@@ -131,6 +131,13 @@ def blocks_read(wildcards):
     return plan(wildcards).blocks_read(f"results/{wildcards.scene}/tiled.tif")
 
 
+def supposed(wildcards):
+    """The file of the directions that networks are told where nobody told them: none where they are known, or not asked for."""
+    return (
+        [f"results/{wildcards.scene}/supposed.json"] if plan(wildcards).supposes else []
+    )
+
+
 def source(wildcards):
     """The folder of a block's detections: by the models, or fed from the truth."""
     return "fed" if plan(wildcards).settings["feed"] == "truth" else "detected"

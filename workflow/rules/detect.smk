@@ -1,6 +1,36 @@
 # Sections and corners of every block, by the models or from the truth, and their union over the seams.
 
 
+given = inputs("supposed", "results/{scene}/supposed.json")
+
+
+rule supposed:
+    """Say from where a scene without angles looks to be seen and lit."""
+    input:
+        scene=given("results/{scene}/scene.json"),
+        raster=given(lambda w: sources.files(blocks_read(w))),
+        model=given("results/{scene}/models/sections.json"),
+    output:
+        "results/{scene}/supposed.json",
+    log:
+        "results/{scene}/logs/supposed.log",
+    benchmark:
+        "results/{scene}/benchmarks/supposed.tsv"
+    conda:
+        RUN
+    threads: lambda w: plan(w).settings["threads"]
+    resources:
+        gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
+    params:
+        signature=signature("supposed"),
+        tiling=lambda w: plan(w).tiling,
+        raster=blocks_read,
+        options=options("provider", "threads"),
+    shell:
+        "python -m kibs_steps.supposed --scene {input.scene:q} --raster {params.raster:q} --model {input.model:q}"
+        " --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q} --out {output:q} > {log:q} 2>&1"
+
+
 given = inputs(
     "sections",
     "results/{scene}/blocks/{block}/sections.tif",
@@ -16,6 +46,7 @@ rule sections:
         scene=given("results/{scene}/scene.json"),
         tiles=given("results/{scene}/blocks/{block}/tiles.tif"),
         model=given("results/{scene}/models/sections.json"),
+        supposed=given(supposed),
     output:
         labels="results/{scene}/blocks/{block}/sections.tif",
         pieces="results/{scene}/blocks/{block}/detected/pieces.parquet",
@@ -34,12 +65,13 @@ rule sections:
         gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("sections"),
+        supposed=lambda w: [f"--supposed={f}" for f in supposed(w)],
         tiling=lambda w: plan(w).tiling,
         options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.sections --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.supposed:q} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} > {log:q} 2>&1"
 
@@ -85,6 +117,7 @@ rule corners:
         blended=given("results/{scene}/blocks/{block}/blended.tif"),
         labels=given("results/{scene}/blocks/{block}/sections.tif"),
         model=given("results/{scene}/models/corners.json"),
+        supposed=given(supposed),
     output:
         corners="results/{scene}/blocks/{block}/detected/corners.parquet",
         heights="results/{scene}/blocks/{block}/detected/heights.parquet",
@@ -101,12 +134,13 @@ rule corners:
         gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("corners"),
+        supposed=lambda w: [f"--supposed={f}" for f in supposed(w)],
         tiling=lambda w: plan(w).tiling,
         options=options("provider", "threads"),
     shell:
         "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --labels {input.labels:q}"
         " --model {input.model:q} --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
-        " {params.options:q} --out {output.corners:q} --heights {output.heights:q} > {log:q} 2>&1"
+        " {params.supposed:q} {params.options:q} --out {output.corners:q} --heights {output.heights:q} > {log:q} 2>&1"
 
 
 given = inputs(
@@ -126,6 +160,7 @@ rule single:
         scene=given("results/{scene}/scene.json"),
         tiles=given("results/{scene}/blocks/{block}/tiles.tif"),
         model=given("results/{scene}/models/sections.json"),
+        supposed=given(supposed),
     output:
         labels="results/{scene}/blocks/{block}/sections.tif",
         pieces="results/{scene}/blocks/{block}/detected/pieces.parquet",
@@ -146,12 +181,13 @@ rule single:
         gpu=lambda w: int(plan(w).settings["provider"] == "cuda"),
     params:
         signature=signature("single"),
+        supposed=lambda w: [f"--supposed={f}" for f in supposed(w)],
         tiling=lambda w: plan(w).tiling,
         options=options("provider", "threads"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.single --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
-        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q}"
+        " --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block} {params.supposed:q} {params.options:q}"
         " --seam-rule {params.seams} --labels {output.labels:q} --pieces {output.pieces:q}"
         " --links {output.links:q} --seams {output.seams:q} --corners {output.corners:q} --heights {output.heights:q} > {log:q} 2>&1"
 

@@ -1,0 +1,165 @@
+"""Supposed directions: from where an image looks to be seen and lit, where nobody told.
+
+A network that knows view and sun finds far more, and it can tell which ones suit: told wrong ones it is unsure of what it sees. So
+the 2D model looks at a few tiles as seen and lit from one direction after another, and the one it is surest with is supposed.
+Networks are told so; nothing is moved by it, for a lean that nobody measured is no measure of heights or places.
+
+In: `scene.json` without view or sun (or both), the raster, the 2D model. Out: `supposed.json`: `view` and `sun`, each with
+azimuth and elevation (deg) and lean, or null where the model is surest without.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kibs_steps import cli, scene, store
+from kibs_steps import view as geometry
+from kibs_steps.grid import Grid, Tile, Tiling, Window
+from kibs_steps.scene import Direction, Scene
+
+AZIMUTHS = tuple(range(0, 360, 45))  # deg
+VIEW_ELEVATIONS = (62.0, 50.0, 75.0)  # deg, the usual one first
+SUN_ELEVATIONS = (45.0, 30.0, 60.0)
+LOOKED_OVER = 12  # tiles, of which the network says how much roof they show
+TRIED = 3  # tiles of most roof
+
+Doubt = Callable[[Direction | None, Direction | None], float]
+
+
+class Supposed(NamedTuple):
+    """View and sun as networks are told; None for what is not known."""
+
+    view: Direction | None
+    sun: Direction | None
+
+
+def directions(doubt: Doubt, view: Direction | None, sun: Direction | None, turned: float = 0.0) -> Supposed:
+    """View and sun of least `doubt` (of a view and a sun); those given are kept.
+
+    The sun first, for shadows tell most, then the view. Azimuths are tried at the usual elevation, then other elevations at the
+    best of them. `turned` is the meridian convergence (deg).
+    """
+    if sun is None:
+        sun = _surest(lambda tried: doubt(view, tried), SUN_ELEVATIONS, turned)
+    if view is None:
+        nadir = Direction(0.0, 90.0, (0.0, 0.0))
+        view = _surest(lambda tried: doubt(tried, sun), VIEW_ELEVATIONS, turned, [nadir])
+    return Supposed(view, sun)
+
+
+def _surest(
+    doubt: Callable[[Direction | None], float],
+    elevations: Sequence[float],
+    turned: float,
+    others: Sequence[Direction] = (),
+) -> Direction | None:
+    def at(azimuth: float, elevation: float) -> Direction:
+        return Direction(azimuth, elevation, geometry.lean(azimuth, elevation, turned))
+
+    tried: list[Direction | None] = [None, *others, *(at(azimuth, elevations[0]) for azimuth in AZIMUTHS)]
+    doubts = [doubt(direction) for direction in tried]
+    best = tried[int(np.argmin(doubts))]
+    if best is not None and best not in others:
+        finer = [at(best.azimuth, elevation) for elevation in elevations[1:]]
+        tried += finer
+        doubts += [doubt(direction) for direction in finer]
+    return tried[int(np.argmin(doubts))]
+
+
+def unsureness(roof: np.ndarray, edge: np.ndarray, data: np.ndarray) -> float:
+    """Mean entropy (nats) of the roof and rim probabilities (s, s) where there is data."""
+    entropy = np.zeros(roof.shape)
+    for chance in (roof, edge):
+        p = np.clip(chance, 1e-4, 1 - 1e-4)
+        entropy -= p * np.log(p) + (1 - p) * np.log(1 - p)
+    return float(entropy[data].mean()) if data.any() else 0.0
+
+
+def looked_over(tiling: Tiling, grid: Grid) -> list[Tile]:
+    """Up to `LOOKED_OVER` tiles, evenly spread over the raster in reading order."""
+    tiles = [
+        t for block in tiling.blocks(grid.width, grid.height) for t in tiling.tiles(block, grid.width, grid.height)
+    ]
+    chosen = np.unique(np.linspace(0, len(tiles) - 1, min(LOOKED_OVER, len(tiles))).round().astype(int))
+    return [tiles[k] for k in chosen]
+
+
+def told(facts: Scene, core: Window, path: str | None = None) -> np.ndarray:
+    """What networks are told of view and sun in a block's `core` (1, 6): what the scene knows, else what is supposed there."""
+    from kibs_steps.models import runtime
+
+    view, sun = facts.view_of(core), facts.sun
+    if path:
+        supposed = read(path)
+        view, sun = view or supposed.view, sun or supposed.sun
+    return runtime.geometry_vector(view and view.lean, sun and sun.lean, facts.grid.gsd)
+
+
+def read(path: str) -> Supposed:
+    """Read `supposed.json`."""
+    content = store.read_json(path)
+    found = (content[name] for name in ("view", "sun"))
+    return Supposed(*(d and Direction(d["azimuth"], d["elevation"], tuple(d["lean"])) for d in found))
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Say from where a scene without angles looks to be seen and lit."""
+    from kibs_steps.models import runtime
+    from kibs_steps.sections import tile_image
+    from kibs_steps.tiles import read_window
+
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.supposed", description=main.__doc__)
+    parser.add_argument("--scene", required=True, help="scene.json")
+    parser.add_argument("--raster", help="a copy to read instead of the scene's raster")
+    parser.add_argument("--model", required=True, help="models/sections.json")
+    parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
+    parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    runtime.add_options(parser)
+    parser.add_argument("--out", required=True, help="out: supposed.json")
+    args = parser.parse_args(argv)
+    facts = scene.read(args.scene)
+    facts = facts._replace(raster=args.raster or facts.raster)
+    task = store.read_json(args.model)["contract"]["task"]
+    model = runtime.from_record(args.model, task)
+    tiling = Tiling(model.contract["tile"], args.margin, args.block)
+    once = model._replace(contract={**model.contract, "flips": 1})
+    session = runtime.opened(once, args.provider, args.threads)
+
+    def network(view: Direction | None, sun: Direction | None) -> runtime.Network:
+        return session(runtime.geometry_vector(view and view.lean, sun and sun.lean, facts.grid.gsd))
+
+    plain = network(facts.view, facts.sun)
+    seen = []
+    for tile in looked_over(tiling, facts.grid):
+        rgb, valid = read_window(facts, tile.core.grown(args.margin))
+        image = tile_image(rgb, tile, tiling, tile.core, facts.grid)
+        data = tile_image(valid, tile, tiling, tile.core, facts.grid, "constant")
+        if data.any():
+            seen.append((float((plain(image)["roof"][0] * data).sum()), image, data))
+    shown = [(image, data) for _, image, data in sorted(seen, key=lambda one: -one[0])[:TRIED]]
+
+    def doubt(view: Direction | None, sun: Direction | None) -> float:
+        run = network(view, sun)
+        maps = [(run(image), data) for image, data in shown]
+        return sum(unsureness(found["roof"][0], found["edge"][0], data) for found, data in maps)
+
+    known = Supposed(facts.view, facts.sun)
+    found = directions(doubt, *known, scene.convergence(facts.grid)) if shown else known
+    store.write_json(args.out, {name: d and d._asdict() for name, d in found._asdict().items()})
+    for name, key, before, direction in (
+        ("seen", "view", facts.view, found.view),
+        ("lit", "sun", facts.sun, found.sun),
+    ):
+        if before is None and direction is not None:
+            print(
+                f"the image looks {name} from azimuth {direction.azimuth:g}°, elevation {direction.elevation:g}°, to some 25°: "
+                f"networks are told so; set {key}_azimuth and {key}_elevation where they are known"
+            )
+
+
+if __name__ == "__main__":
+    cli.run(main, pandas=False)
