@@ -37,7 +37,7 @@ DEFAULTS = {
     "threads": 1,
     "lod_label": "2.0",
     "drape": False,
-    "suppose": True,
+    "suppose": False,
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
 TASKS = {"two_stage": ("sections", "corners"), "single": ("both",)}

@@ -1,11 +1,11 @@
 """Supposed directions: from where an image looks to be seen and lit, where nobody told.
 
-A network that knows view and sun finds far more, and it can tell which ones suit: told wrong ones it is unsure of what it sees. So
-the 2D model looks at a few tiles as seen and lit from one direction after another, and the one it is surest with is supposed.
-Networks are told so; nothing is moved by it, for a lean that nobody measured is no measure of heights or places.
+A network that knows view and sun finds far more, and it can tell which ones suit: told wrong ones it is unsure of what it sees.
+So the 2D model looks at a few tiles as seen and lit from one direction after another, and the one it is surest with is supposed.
+Networks are told so; nothing is moved by it, for a lean that nobody measured is no measure of places.
 
 In: `scene.json` without view or sun (or both), the raster, the 2D model. Out: `supposed.json`: `view` and `sun`, each with
-azimuth and elevation (deg) and lean, or null where the model is surest without.
+azimuth and elevation (deg) and lean, or null where there is nothing to look at.
 """
 
 from __future__ import annotations
@@ -21,13 +21,28 @@ from kibs_steps import view as geometry
 from kibs_steps.grid import Grid, Tile, Tiling, Window
 from kibs_steps.scene import Direction, Scene
 
+NADIR = Direction(0.0, 90.0, (0.0, 0.0))
 AZIMUTHS = tuple(range(0, 360, 45))  # deg
 VIEW_ELEVATIONS = (62.0, 50.0, 75.0)  # deg, the usual one first
 SUN_ELEVATIONS = (45.0, 30.0, 60.0)
 LOOKED_OVER = 12  # tiles, of which the network says how much roof they show
 TRIED = 3  # tiles of most roof
+LEAST_ROOF = 0.005  # of the tiles: with less there is nothing to tell a view by
 
-Doubt = Callable[[Direction | None, Direction | None], float]
+
+class Doubt(NamedTuple):
+    """What a network says of the tiles it looks at: mean entropy of roofs and rims (nats), share of roof."""
+
+    entropy: float
+    roof: float
+
+    @property
+    def by_roof(self) -> float:
+        """Entropy for the roof that is seen: who sees little is easily sure."""
+        return self.entropy / max(self.roof, LEAST_ROOF)
+
+
+Look = Callable[[Direction | None, Direction | None], Doubt]
 
 
 class Supposed(NamedTuple):
@@ -37,46 +52,40 @@ class Supposed(NamedTuple):
     sun: Direction | None
 
 
-def directions(doubt: Doubt, view: Direction | None, sun: Direction | None, turned: float = 0.0) -> Supposed:
-    """View and sun of least `doubt` (of a view and a sun); those given are kept.
+def directions(look: Look, view: Direction | None, sun: Direction | None, turned: float = 0.0) -> Supposed:
+    """View and sun with which a `look` (at a view and a sun) leaves least doubt; those given are kept.
 
-    The sun first, for shadows tell most, then the view. Azimuths are tried at the usual elevation, then other elevations at the
-    best of them. `turned` is the meridian convergence (deg).
+    The sun first, for shadows tell most, by the entropy; then the view, nadir too, by the entropy for the roof seen.
+    Azimuths are tried at the usual elevation, then other elevations at the best of them. `turned`: meridian convergence (deg).
     """
     if sun is None:
-        sun = _surest(lambda tried: doubt(view, tried), SUN_ELEVATIONS, turned)
+        sun = _surest(lambda tried: look(view, tried).entropy, SUN_ELEVATIONS, turned)
     if view is None:
-        nadir = Direction(0.0, 90.0, (0.0, 0.0))
-        view = _surest(lambda tried: doubt(tried, sun), VIEW_ELEVATIONS, turned, [nadir])
+        view = _surest(lambda tried: look(tried, sun).by_roof, VIEW_ELEVATIONS, turned, [NADIR])
     return Supposed(view, sun)
 
 
 def _surest(
-    doubt: Callable[[Direction | None], float],
-    elevations: Sequence[float],
-    turned: float,
-    others: Sequence[Direction] = (),
-) -> Direction | None:
+    doubt: Callable[[Direction], float], elevations: Sequence[float], turned: float, others: Sequence[Direction] = ()
+) -> Direction:
     def at(azimuth: float, elevation: float) -> Direction:
         return Direction(azimuth, elevation, geometry.lean(azimuth, elevation, turned))
 
-    tried: list[Direction | None] = [None, *others, *(at(azimuth, elevations[0]) for azimuth in AZIMUTHS)]
+    tried = [*others, *(at(azimuth, elevations[0]) for azimuth in AZIMUTHS)]
     doubts = [doubt(direction) for direction in tried]
     best = tried[int(np.argmin(doubts))]
-    if best is not None and best not in others:
+    if best not in others:
         finer = [at(best.azimuth, elevation) for elevation in elevations[1:]]
         tried += finer
         doubts += [doubt(direction) for direction in finer]
     return tried[int(np.argmin(doubts))]
 
 
-def unsureness(roof: np.ndarray, edge: np.ndarray, data: np.ndarray) -> float:
-    """Mean entropy (nats) of the roof and rim probabilities (s, s) where there is data."""
-    entropy = np.zeros(roof.shape)
-    for chance in (roof, edge):
-        p = np.clip(chance, 1e-4, 1 - 1e-4)
-        entropy -= p * np.log(p) + (1 - p) * np.log(1 - p)
-    return float(entropy[data].mean()) if data.any() else 0.0
+def doubt(roof: np.ndarray, edge: np.ndarray) -> Doubt:
+    """What roof and rim probabilities (n,) of pixels with data say."""
+    chances = np.clip(np.stack([roof, edge]).astype(np.float64), 1e-4, 1 - 1e-4)
+    entropy = -(chances * np.log(chances) + (1 - chances) * np.log1p(-chances)).sum(axis=0)
+    return Doubt(float(entropy.mean()), float((roof > 0.5).mean()))
 
 
 def looked_over(tiling: Tiling, grid: Grid) -> list[Tile]:
@@ -142,13 +151,13 @@ def main(argv: list[str] | None = None) -> None:
             seen.append((float((plain(image)["roof"][0] * data).sum()), image, data))
     shown = [(image, data) for _, image, data in sorted(seen, key=lambda one: -one[0])[:TRIED]]
 
-    def doubt(view: Direction | None, sun: Direction | None) -> float:
+    def look(view: Direction | None, sun: Direction | None) -> Doubt:
         run = network(view, sun)
         maps = [(run(image), data) for image, data in shown]
-        return sum(unsureness(found["roof"][0], found["edge"][0], data) for found, data in maps)
+        return doubt(*(np.concatenate([found[name][0][data] for found, data in maps]) for name in ("roof", "edge")))
 
     known = Supposed(facts.view, facts.sun)
-    found = directions(doubt, *known, scene.convergence(facts.grid)) if shown else known
+    found = directions(look, *known, scene.convergence(facts.grid)) if shown else known
     store.write_json(args.out, {name: d and d._asdict() for name, d in found._asdict().items()})
     for name, key, before, direction in (
         ("seen", "view", facts.view, found.view),
