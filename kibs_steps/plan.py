@@ -303,8 +303,8 @@ def signatures(
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
     inference = some("provider", "threads")  # sums in another order differ in their last bits
-    s["supposed"] = h(s["tiles"], models["sections"].sha256, angles, inference)
     if supposes(settings, models):
+        s["supposed"] = h(s["tiles"], models["sections"].sha256, angles, inference)
         seen = {task: told and [told, s["supposed"]] for task, told in seen.items()}
     s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"], inference)
     s["blend"] = h(s["sections"], models["corners"].sha256)

@@ -80,7 +80,7 @@ def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
         options = [f"--checkpoint={tmp_path}/checkpoint.pt", "--task=sections", f"--out={tmp_path}/new.onnx"]
         export.main([*options, f"--like={tmp_path}/like.onnx"])
         contract = contracts.load(tmp_path / "new.onnx", "sections").contract
-        assert contract["thresholds"] == {"roof": 0.66, "prominence": 0.2, "min_area": min_area}
+        assert contract["thresholds"] == {"roof": 0.66, "prominence": 0.2, "min_area": min_area, "sure": 0.6}
         assert contract["score"] == weights
 
 
