@@ -136,6 +136,7 @@ def test_edited_sections_and_a_surface_model_start_where_they_are_used(files):
     assert {"scene", "planes"} <= changed(files, regions=str(folder / "regions.gpkg"))
     assert not {"tiles", "sections"} & changed(files, regions=str(folder / "regions.gpkg"))
     assert changed(files, drape=True) == {"glb", "run"}
+    assert changed(files, suppose=True) == {"run"}  # networks that take no directions are told none
 
 
 def test_angles_come_from_metadata(files):
