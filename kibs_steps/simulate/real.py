@@ -17,7 +17,7 @@ import numpy as np
 
 from kibs_steps.simulate import furniture, ground, roofs
 from kibs_steps.simulate.city import lay_out
-from kibs_steps.simulate.citymodel import Building, CityModel
+from kibs_steps.simulate.citymodel import Building, CityModel, Polygon
 from kibs_steps.simulate.pieces import ROOF, WALL, City, Face, Place, pick
 from kibs_steps.simulate.site import Site
 from kibs_steps.simulate.surfaces import palette
@@ -25,8 +25,13 @@ from kibs_steps.terrain import Terrain
 
 LEAST = 0.8  # m²: smaller roof surfaces are shown but are no sections
 STOREY = 1.8  # m: eaves stay this far above the ground uphill
+FOOT = 0.05  # m: what is lower than that above a building's base is its foot
 SPARSE = 0.1  # share of ground built on below which procedural houses stand between
 SPACING = 60.0  # m: neighbours within such squares tend to have the same roofs
+GROWN = 0.5  # of the tiles of a real city: their houses have more storeys than the file says, as a city's centre has
+STOREYS = 5  # at most, added to all houses alike, one more or less to each
+STOREY_HEIGHT = 3.1  # m
+LOWEST_HOUSE = 5.0  # m: what is lower is a shed or a garage
 
 
 class Window(NamedTuple):
@@ -46,7 +51,7 @@ class Window(NamedTuple):
 def city(rng: np.random.Generator, model: CityModel, area: tuple[float, float, float, float], terrain: Terrain) -> City:
     """A part of a real city, cut out around one of its buildings and turned at random, over `area` (left, bottom, right, top).
 
-    Its buildings stand on `terrain`, each as high as it is.
+    Its buildings stand on `terrain`, each as high as it is, or all of them higher by some storeys.
     """
     centres = np.array([b.centre for b in model.buildings])
     hosts = centres[rng.integers(len(centres), size=3)]
@@ -54,7 +59,24 @@ def city(rng: np.random.Generator, model: CityModel, area: tuple[float, float, f
     crowd = [(np.abs(centres - host) < (area[2] - area[0]) / 2).all(1).sum() for host in hosts]
     centre = hosts[int(np.argmax(crowd))] + rng.normal(0, 12, 2)
     middle = ((area[0] + area[2]) / 2, (area[1] + area[3]) / 2)
-    return _laid(rng, model, area, terrain, Window(tuple(centre.tolist()), middle, rng.uniform(0, 2 * np.pi)))
+    window = Window(tuple(centre.tolist()), middle, rng.uniform(0, 2 * np.pi))
+    storeys = int(rng.integers(1, STOREYS + 1)) if rng.random() < GROWN else 0
+    return _laid(rng, model, area, terrain, window, storeys)
+
+
+def grown(building: Building, storeys: int) -> Building:
+    """A house with more storeys under the same roofs; sheds and garages stay as they are."""
+    if max(float(face.ring[:, 2].max()) for face in building.roofs) - building.base < LOWEST_HOUSE:
+        return building
+
+    def lifted(face: Polygon) -> Polygon:
+        def up(ring: np.ndarray) -> np.ndarray:
+            rise = np.where(ring[:, 2] > building.base + FOOT, storeys * STOREY_HEIGHT, 0.0)
+            return ring + rise[:, None] * [0.0, 0.0, 1.0]
+
+        return face._replace(ring=up(face.ring), holes=tuple(up(hole) for hole in face.holes))
+
+    return building._replace(roofs=[lifted(f) for f in building.roofs], walls=[lifted(f) for f in building.walls])
 
 
 def as_surveyed(
@@ -90,6 +112,7 @@ def _laid(
     area: tuple[float, float, float, float],
     terrain: Terrain,
     window: Window,
+    storeys: int = 0,
 ) -> City:
     kit = palette(rng)
     site = Site(rng, terrain, kit, area, 0.0)
@@ -106,6 +129,8 @@ def _laid(
         square = tuple(int(c // SPACING) for c in building.centre)
         if rng.random() < alike:
             materials = shared.setdefault(square, materials)
+        if storeys:
+            building = grown(building, storeys + int(rng.integers(-1, 2)))
         _stand(site, building, Place(*position, window.turn), window.keep, materials, plots)
     if not window.keep and (plots > 0).mean() < SPARSE:
         ground.between(site, plots, lambda: lay_out(site, pick(rng, ("suburb", "rows", "village", "town"))))
@@ -166,7 +191,7 @@ def _stand(
             plots[found[0]][found[1] > 0] = number
     for face in building.walls:
         ring, *holes = (r - origin for r in (face.ring, *face.holes))
-        ring[ring[:, 2] < 0.05, 2] += foot
+        ring[ring[:, 2] < FOOT, 2] += foot
         site.faces.append(Face(place.put(ring), tuple(place.put(h) for h in holes), WALL, 0, number, wall, paint))
 
 

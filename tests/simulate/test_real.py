@@ -42,6 +42,19 @@ def test_buildings_keep_their_shape_in_a_turned_window(model, relief):
         assert above.min() > 1.5  # no eave is buried
 
 
+def test_a_house_grows_by_storeys_and_keeps_its_roof_and_its_feet(tmp_path):
+    shed = cities.gable(60, 0, 2.0, 4, 3, 2, 0.5)
+    house, low = citymodel.read(cities.write(tmp_path / "c.json", [HOUSES[0], shed])).buildings
+    higher = real.grown(house, 2)
+    for before, after in zip(house.roofs, higher.roofs, strict=True):
+        assert np.allclose(after.ring - before.ring, [0, 0, 2 * real.STOREY_HEIGHT])
+    for before, after in zip(house.walls, higher.walls, strict=True):
+        up = before.ring[:, 2] > house.base + 1
+        assert np.allclose((after.ring - before.ring)[up], [0, 0, 2 * real.STOREY_HEIGHT])
+        assert np.array_equal(after.ring[~up], before.ring[~up])
+    assert real.grown(low, 2) is low
+
+
 def test_a_surveyed_city_is_seen_where_its_file_says(model, tmp_path):
     import geopandas
 
