@@ -45,14 +45,20 @@ def contract(task: str, /, **changes: object) -> dict:
 
 
 def save(
-    nodes: list, constants: dict[str, np.ndarray], outputs: dict[str, list], path: Path, terms: dict | None
+    nodes: list,
+    constants: dict[str, np.ndarray],
+    outputs: dict[str, list],
+    path: Path,
+    terms: dict | None,
+    geometry: bool = False,
 ) -> Path:
-    """Write an ONNX model of one image input."""
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, TILE, TILE])
+    """Write an ONNX model of an image, and of view and sun if it looks at `geometry`."""
+    inputs = {"image": [1, 3, TILE, TILE]} | ({"geometry": [1, 6]} if geometry else {})
+    given = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in inputs.items()]
     out = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in outputs.items()]
     init = [numpy_helper.from_array(np.asarray(v), k) for k, v in constants.items()]
     model = helper.make_model(
-        helper.make_graph(nodes, "toy", [image], out, init), opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+        helper.make_graph(nodes, "toy", given, out, init), opset_imports=[helper.make_opsetid("", 17)], ir_version=8
     )
     if terms is not None:
         helper.set_model_props(model, {"kibs": json.dumps(terms)})
@@ -123,6 +129,24 @@ def sections_model(path: Path, terms: dict | None = None) -> Path:
     used = {name for node in nodes for name in node.input}
     constants = {k: v for k, v in constants.items() if k in used}
     return save(nodes, constants, outputs, path, contract("sections") if terms is None else terms)
+
+
+def lit_sections_model(path: Path) -> Path:
+    """The same roofs, seen the more surely the farther north (up) the shadow falls that it is told of."""
+    nodes, constants, outputs = section_parts()
+    n = helper.make_node
+    nodes[1:3] = [
+        n("Sub", ["red", "red_level"], ["red1"]),
+        n("Slice", ["geometry", "i3", "i4", "axis"], ["shadow_down"]),
+        n("Neg", ["shadow_down"], ["shadow_up"]),
+        n("Relu", ["shadow_up"], ["north"]),
+        n("Mul", ["north", "share"], ["gain"]),
+        n("Add", ["gain", "least"], ["sureness"]),
+        n("Mul", ["red1", "sureness"], ["red0"]),
+        n("Sigmoid", ["red0"], ["roof"]),
+    ]
+    constants |= {"i4": np.array([4], np.int64), "least": np.float32(0.02), "share": np.float32(0.01)}
+    return save(nodes, constants, outputs, path, contract("sections", geometry_input=True), geometry=True)
 
 
 def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> Path:

@@ -98,3 +98,24 @@ def test_the_scene_chooses_from_a_suite(tmp_path):
     assert "suite/oblique/sections.onnx" in (folder / "results/town/run.json").read_text()
     done = jobs(run(folder, models="suite", block=4, view_elevation=80, only=["run.json"]))
     assert {"sections", "corners"} <= set(done)
+
+
+def test_a_sun_that_nobody_told_is_supposed_on_request(tmp_path):
+    folder = world(tmp_path)
+    toy.lit_sections_model(folder / "models/sections.onnx")
+    plain = run(folder, block=4, only=NEEDED)
+    assert "supposed" not in jobs(plain)
+    known = digests(folder, files=["points.txt"])
+    done = jobs(run(folder, block=4, suppose=True, only=NEEDED))
+    assert done["supposed"] == 1
+    assert {"sections", "points"} <= set(done)
+    assert not {"scene", "tiles"} & set(done)
+    found = json.loads((folder / "results/town/supposed.json").read_text())
+    assert (found["sun"]["azimuth"], found["sun"]["elevation"]) == (180.0, 30.0)  # the longest shadow to the north
+    assert found["view"]["azimuth"] == toy.VIEW["view_azimuth"]
+    assert "lit from azimuth 180°" in (folder / "results/town/logs/supposed.log").read_text()
+    assert jobs(run(folder, block=4, suppose=True, only=NEEDED)) == {}
+    # A sun that is told is not supposed; roofs are where they were, as nothing is moved by a sun.
+    done = jobs(run(folder, block=4, suppose=True, sun_azimuth=180, sun_elevation=30, only=NEEDED))
+    assert "supposed" not in done
+    assert digests(folder, files=["points.txt"]) == known
