@@ -38,12 +38,13 @@ def simulated(
     cities: Sequence[CityModel] = (),
     houses: Sequence[House] = (),
     gsd: float = GSD,
+    tall: bool = False,
 ) -> Sample:
     """A tile of the simulator at about `gsd`, seen from elevations (deg) in a range, from all sides, lit from anywhere.
 
     `backgrounds` are photographs (rgb, usable as ground: bool) for the simulator's ground. `view` and `sun` (azimuth, elevation
     deg) fix the directions but for a degree or two, for models of one scene. Some tiles show one of the real `cities`, some
-    photographed `houses` (`simulate.draped`).
+    photographed `houses` (`simulate.draped`); with `tall` all show tall buildings.
     """
     from kibs_steps.simulate.scene import random_scene
 
@@ -57,6 +58,7 @@ def simulated(
         sun=near(sun, rng),
         cities=cities,
         houses=houses,
+        tall=tall,
     )
     section = rendering.section.astype(np.int32)
     return Sample(

@@ -28,6 +28,7 @@ SHARES = {"simulated": 0.62, "pasted": 0.23, "chips": 0.15, "own": 0.3}  # of th
 NON_COMMERCIAL = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
 SIMULATED = "MIT, as the code: trained on simulated scenes only"
 OWN = "as the owner of the training data decides"
+TALL_EVERY = 3  # one simulated tile in so many shows tall buildings
 HELD_OUT = 900_000  # seeds of simulated validation tiles begin here
 TOLD_ANGLES = 3.0  # deg: how far from the one view of its training a fine-tuned model may be used
 
@@ -204,7 +205,14 @@ def fill_pool(
         if not path.exists():
             rng = np.random.default_rng([seed, number])
             sample = dataset.simulated(
-                rng, backgrounds=backgrounds, view=view, sun=sun, cities=cities, houses=houses, gsd=gsd
+                rng,
+                backgrounds=backgrounds,
+                view=view,
+                sun=sun,
+                cities=cities,
+                houses=houses,
+                gsd=gsd,
+                tall=number % TALL_EVERY == TALL_EVERY - 1,
             )
             sample.save(path)
 

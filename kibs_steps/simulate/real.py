@@ -28,7 +28,7 @@ STOREY = 1.8  # m: eaves stay this far above the ground uphill
 FOOT = 0.05  # m: what is lower than that above a building's base is its foot
 SPARSE = 0.1  # share of ground built on below which procedural houses stand between
 SPACING = 60.0  # m: neighbours within such squares tend to have the same roofs
-GROWN = 0.5  # of the tiles of a real city: their houses have more storeys than the file says, as a city's centre has
+GROWN = 0.5  # of a real city's tiles: their houses have more storeys than the file says, as a city's centre has
 STOREYS = 5  # at most, added to all houses alike, one more or less to each
 STOREY_HEIGHT = 3.1  # m
 LOWEST_HOUSE = 5.0  # m: what is lower is a shed or a garage
@@ -48,10 +48,16 @@ class Window(NamedTuple):
         return (x_y - self.centre) @ np.array([[c, s], [-s, c]]) + self.onto
 
 
-def city(rng: np.random.Generator, model: CityModel, area: tuple[float, float, float, float], terrain: Terrain) -> City:
+def city(
+    rng: np.random.Generator,
+    model: CityModel,
+    area: tuple[float, float, float, float],
+    terrain: Terrain,
+    share_grown: float = GROWN,
+) -> City:
     """A part of a real city, cut out around one of its buildings and turned at random, over `area` (left, bottom, right, top).
 
-    Its buildings stand on `terrain`, each as high as it is, or all of them higher by some storeys.
+    Its buildings stand on `terrain`, each as high as it is, or (`share_grown` of such parts) all of them higher by some storeys.
     """
     centres = np.array([b.centre for b in model.buildings])
     hosts = centres[rng.integers(len(centres), size=3)]
@@ -60,7 +66,7 @@ def city(rng: np.random.Generator, model: CityModel, area: tuple[float, float, f
     centre = hosts[int(np.argmax(crowd))] + rng.normal(0, 12, 2)
     middle = ((area[0] + area[2]) / 2, (area[1] + area[3]) / 2)
     window = Window(tuple(centre.tolist()), middle, rng.uniform(0, 2 * np.pi))
-    storeys = int(rng.integers(1, STOREYS + 1)) if rng.random() < GROWN else 0
+    storeys = int(rng.integers(1, STOREYS + 1)) if rng.random() < share_grown else 0
     return _laid(rng, model, area, terrain, window, storeys)
 
 

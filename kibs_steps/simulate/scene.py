@@ -27,6 +27,9 @@ from kibs_steps.terrain import Terrain, flat
 
 # Azimuth, elevation and half angle (deg) of views that random scenes never show: models are judged there.
 HELD_OUT_CONE = (250.0, 62.0, 5.0)
+TALL_STYLES = ("centre", "perimeter")
+TALL_CITIES = 0.55  # of the tiles of tall buildings show real cities, if there are any
+TALL_GROWN = 0.8  # of those have grown
 
 
 def _direction(azimuth: float, elevation: float, convergence: float = 0.0) -> Direction:
@@ -93,13 +96,17 @@ def random_scene(
     house_share: float = 0.2,
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
+    tall: bool = False,
 ) -> tuple[Rendering, np.ndarray]:
     """A random tile of `size`² px with its truth, and the networks' geometry vector (float32 (6,), docs/architecture.md).
 
     `city_share` of the tiles show a part of one of the real `cities`, if there are any; the others are procedural, of one `style`
     or of any, `house_share` of them with photographed `houses`, if there are any. `view` and `sun` (azimuth, elevation deg) stand
-    in for random directions within the ranges.
+    in for random directions within the ranges. `tall`: a city's centre or perimeter blocks, or a real city whose houses have
+    mostly grown, so that heights above 10 m are not the exception.
     """
+    if tall:
+        city_share, houses, style = TALL_CITIES, (), style or str(rng.choice(TALL_STYLES))
     side = size * gsd
     grid = Grid("", 0.0, side, gsd, size, size)
     seen_from = _direction(*(view or _random_view(rng, *view_elevation)))
@@ -123,7 +130,8 @@ def random_scene(
 
     def build() -> City:
         if model:
-            return real.city(rng, model, (-margin, -margin, wide - margin, wide - margin), terrain)
+            area = (-margin, -margin, wide - margin, wide - margin)
+            return real.city(rng, model, area, terrain, TALL_GROWN if tall else real.GROWN)
         return procedural(rng, wide, wide, terrain, style, (-margin, -margin), stock)
 
     city = build()
