@@ -23,10 +23,11 @@ SHARED = 0.25  # of a section's area: more of it on a second house, and it is ov
 
 
 class Count(NamedTuple):
-    """Share of each house (n,) that sections cover, and whether it is found (n,)."""
+    """Share of each house (n,) that sections cover, whether it is found (n,), and the share of all sections' area on houses."""
 
     covered: NDArray[np.float64]
     found: NDArray[np.bool_]
+    on_houses: float
 
 
 def count(houses: NDArray[np.object_], sections: NDArray[np.object_]) -> Count:
@@ -36,7 +37,8 @@ def count(houses: NDArray[np.object_], sections: NDArray[np.object_]) -> Count:
     together = shapely.union_all(sections)
     covered = shapely.area(shapely.intersection(houses, together)) / shapely.area(houses)
     spoilt = (on[:, over_two] > 0).any(axis=1)
-    return Count(covered, (covered >= COVERED) & ~spoilt)
+    on_houses = float(on.sum() / max(shapely.area(sections).sum(), 1e-9))
+    return Count(covered, (covered >= COVERED) & ~spoilt, on_houses)
 
 
 def read_sections(path: Path, size: tuple[int, int]) -> NDArray[np.object_]:
@@ -69,7 +71,8 @@ def main(argv: list[str] | None = None) -> None:
         told = count(houses, sections)
         missed = ", ".join(f"{k + 1} ({told.covered[k]:.2f})" for k in np.flatnonzero(~told.found))
         print(
-            f"{path}: {told.found.sum()} of {len(houses)} houses by {len(sections)} sections; missed (covered): {missed}"
+            f"{path}: {told.found.sum()} of {len(houses)} houses by {len(sections)} sections, {told.on_houses:.0%} of their area "
+            f"on these houses; missed (covered): {missed}"
         )
 
 

@@ -24,6 +24,7 @@ def test_half_covered_is_found():
     told = houses.count(DRAWN, sections)
     assert told.covered == pytest.approx([0.5, 0.4, 1.0])
     assert told.found.tolist() == [True, False, True]
+    assert told.on_houses == pytest.approx((50 + 40 + 100) / (50 + 40 + 500))
 
 
 def test_parts_count_together_and_only_once():
@@ -56,7 +57,10 @@ def test_a_published_city_is_counted(tmp_path, capsys):
     drawn = tmp_path / "houses.json"
     drawn.write_text(json.dumps({"size": [80, 40], "outlines": outlines}))
     houses.main([str(tmp_path / "city.gpkg"), f"--houses={drawn}"])
-    assert "1 of 3 houses by 1 sections; missed (covered): 2 (0.00), 3 (0.00)" in capsys.readouterr().out
+    assert (
+        "1 of 3 houses by 1 sections, 100% of their area on these houses; missed (covered): 2 (0.00), 3 (0.00)"
+        in capsys.readouterr().out
+    )
     drawn.write_text(json.dumps({"size": [80, 41], "outlines": outlines}))
     with pytest.raises(KibsError, match="80 × 40 px"):
         houses.main([str(tmp_path / "city.gpkg"), f"--houses={drawn}"])
