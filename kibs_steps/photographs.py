@@ -19,6 +19,7 @@ GRAPH_GSD = 0.06  # m per px, about, of the roof-graph photographs
 REDUCED = 3  # they are kept in memory this many times smaller
 # Folders of chips with the GSD (m) their houses suggest; the WHU city chips are of many resolutions.
 CHIPS = {"inria": 0.3, "spacenet": 0.3, "whu_east_asia": 0.3, "nzlnd": 0.4, "whu_sample": 0.6}
+FREE = {"spacenet"}  # of them those under a free licence (CC BY-SA 4.0)
 
 
 class NoTrainingData(KibsError):

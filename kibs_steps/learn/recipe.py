@@ -16,6 +16,7 @@ DEFAULTS = {
     "family": "dense",
     "networks": "shared",
     "data": None,
+    "free": False,
     "own": [],
     "split": "blocks",
     "scene": None,
@@ -85,6 +86,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
     options += [f"--family={train['family']}"]
     options += [f"--{key}={train[key]}" for key in ("data", "steps", "gsd") if train[key] is not None]
+    options += ["--free"] if train["free"] else []
     for key in ("cities", "leave_out"):
         if train[key]:
             options += [f"--{key.replace('_', '-')}", *map(str, train[key])]

@@ -26,6 +26,7 @@ from kibs_steps.simulate import citymodel, draped
 NAMES = ("simulated", "pasted", "chips", "own")
 SHARES = {"simulated": 0.62, "pasted": 0.23, "chips": 0.15, "own": 0.3}  # of those there are, scaled to sum to 1
 NON_COMMERCIAL = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
+SHARE_ALIKE = "CC BY-SA 4.0: trained on SpaceNet-2 images under that licence"
 SIMULATED = "MIT, as the code: trained on simulated scenes only"
 OWN = "as the owner of the training data decides"
 TALL_EVERY = 3  # one simulated tile in so many shows tall buildings
@@ -45,6 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options that say what to learn from."""
     parser.add_argument("--data", help="data folder with roofgraph/roofgraph.tar and chips/; none: no photographs")
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
+    parser.add_argument(
+        "--free", action="store_true", help="of DATA take what is under a free licence alone: chips of SpaceNet-2"
+    )
     parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
     parser.add_argument("--own", nargs="*", default=[], help="folders of own samples (learn.own)")
     parser.add_argument("--gsd", type=float, default=dataset.GSD, help="of the model to train, m per px")
@@ -87,8 +91,9 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if args.data:
         data = Path(args.data)
         roof_graphs = args.roofgraph or data / "roofgraph" / "roofgraph.tar"
-        graphs = photographs.read_roof_graphs(roof_graphs)
-        chips = [c for c in photographs.read_chips(data / "chips") if c.name.split("/")[0] not in args.leave_out]
+        graphs = [] if args.free else photographs.read_roof_graphs(roof_graphs)
+        places = (photographs.FREE if args.free else set(photographs.CHIPS)) - set(args.leave_out)
+        chips = [c for c in photographs.read_chips(data / "chips") if c.name.split("/")[0] in places]
     training = [graph for graph in graphs if not photographs.held_out(graph)]
     own = [path for folder in args.own for path in sorted(Path(folder, "training").glob("[!.]*.npz"))]
     if args.own and not own:
@@ -148,9 +153,11 @@ def about(
     data += [f"simulated scenes of the city in {Path(city).name}" for city in args.cities]
     data += ["roof-graph photographs (Ren et al. 2021), pasted"] if graphs else []
     without = f", without {', '.join(args.leave_out)}" if args.leave_out else ""
-    data += [f"chips with building masks{without}"] if chips else []
+    of = " of SpaceNet-2" if args.free else ""
+    data += [f"chips with building masks{of}{without}"] if chips else []
     data += [f"own samples: {Path(folder).name}" for folder in args.own]
-    licence = NON_COMMERCIAL if graphs or chips else OWN if args.own else SIMULATED
+    bound = SHARE_ALIKE if args.free else NON_COMMERCIAL
+    licence = bound if graphs or chips else OWN if args.own else SIMULATED
     found: dict[str, Any] = {"data": data, "licence": licence}
     records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
     for name, direction in (("view", view), ("sun", sun)):

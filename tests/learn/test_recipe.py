@@ -31,6 +31,11 @@ def test_another_gsd_is_that_of_the_network_and_of_own_tiles(tmp_path):
     assert not [o for o in recipe.own_options(found.own["town"], "blocks", 0) if "gsd" in o]
 
 
+def test_free_sources_are_asked_for(tmp_path):
+    assert "--free" in recipe.recipe({"train": {"data": "kibs", "free": True}}, tmp_path).training["both"]
+    assert "--free" not in recipe.recipe({"train": {"data": "kibs"}}, tmp_path).training["both"]
+
+
 def test_own_data_of_a_scene_and_of_its_own(tmp_path):
     outlines = {"name": "roofs", "raster": "r.tif", "dtm": "d.tif", "buildings": "b.gpkg", "bands": [5, 3, 2]}
     config = {

@@ -2,6 +2,7 @@
 
 import argparse
 
+import cv2
 import numpy as np
 import pytest
 
@@ -101,3 +102,26 @@ def test_nothing_to_learn_from_is_said(tmp_path):
         empty.mixture[0]
     with pytest.raises(argparse.ArgumentTypeError, match="no source"):
         sources.shares("simulatd=1")
+
+
+def chips_in(folder, *places):
+    """A data folder with one chip of each place and no roof photographs."""
+    for place in places:
+        for part in ("images", "gt"):
+            (folder / "chips" / place / part).mkdir(parents=True)
+            cv2.imwrite(str(folder / "chips" / place / part / "a.png"), np.full((64, 64, 3), 90, np.uint8))
+    return folder
+
+
+def test_free_sources_are_those_anyone_may_use(tmp_path):
+    data = chips_in(tmp_path / "data", "inria", "spacenet", "nzlnd")
+    options = ("--tiles=0", f"--data={data}", f"--out={tmp_path}/run/both")
+    found = sources.gather(arguments("--free", *options), 48)
+    assert [chip.name for chip in found.mixture.chips] == ["spacenet/a"]
+    assert not found.mixture.graphs
+    assert found.about["licence"] == sources.SHARE_ALIKE
+    assert found.about["data"] == ["chips with building masks of SpaceNet-2"]
+    none = sources.gather(arguments("--free", *options, "--leave-out", "spacenet"), 48)
+    assert none.about["licence"] == sources.SIMULATED
+    with pytest.raises(photographs.NoTrainingData, match="roofgraph"):
+        sources.gather(arguments(*options), 48)
