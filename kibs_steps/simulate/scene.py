@@ -27,6 +27,10 @@ from kibs_steps.terrain import Terrain, flat
 
 # Azimuth, elevation and half angle (deg) of views that random scenes never show: models are judged there.
 HELD_OUT_CONE = (250.0, 62.0, 5.0)
+STEEP, ABOVE = (
+    0.2,
+    80.0,
+)  # share of random views that are of this elevation (deg) and more: orthophotos, near-nadir images
 TALL_STYLES = ("centre", "perimeter")
 TALL_CITIES = 0.55  # of the tiles of tall buildings show real cities, if there are any
 TALL_GROWN = 0.8  # of those have grown
@@ -72,10 +76,12 @@ def _roofs_within(city: City, side: float) -> int:
 
 
 def _random_view(rng: np.random.Generator, low: float, high: float) -> tuple[float, float]:
-    """Azimuth and elevation (deg) of a satellite, oblique views more often than steep ones, never within HELD_OUT_CONE."""
+    """Azimuth and elevation (deg) of a satellite, oblique views more often than steep ones, or (share STEEP) of an aeroplane
+    from about above; never within HELD_OUT_CONE."""
     while True:
         azimuth = rng.uniform(0, 360)
-        elevation = min(rng.triangular(low, low + 0.3 * (high - low), high) if high > low else low, 89.9)
+        least = max(low, min(ABOVE, high)) if rng.random() < STEEP else low
+        elevation = min(rng.triangular(least, least + 0.3 * (high - least), high) if high > least else least, 89.9)
         held_azimuth, held_elevation, cone = HELD_OUT_CONE
         off = abs((azimuth - held_azimuth + 180) % 360 - 180)
         if high == low or np.hypot(off * np.cos(np.radians(held_elevation)), elevation - held_elevation) > cone:

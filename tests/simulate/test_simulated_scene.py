@@ -158,6 +158,17 @@ def test_heights_on_a_sloping_plane():
     assert abs(len(rows) * 0.09 - 400 / (1 - 0.12 * geometry.lean(250, 50)[0])) < 12
 
 
+def test_random_views_are_of_satellites_and_some_from_above():
+    rng = np.random.default_rng(3)
+    views = np.array([scene._random_view(rng, 45, 90) for _ in range(2000)])
+    assert 0.2 < (views[:, 1] >= 80).mean() < 0.3
+    assert 0.25 < (views[:, 1] < 60).mean() < 0.33  # of the triangle 0.365, of four in five
+    azimuth, elevation, cone = scene.HELD_OUT_CONE
+    away = np.hypot((views[:, 0] - azimuth) * np.cos(np.radians(elevation)), views[:, 1] - elevation)
+    assert away.min() > cone
+    assert {scene._random_view(rng, 59.3, 59.3)[1] for _ in range(20)} == {59.3}
+
+
 def test_same_seed_same_bytes():
     a, g = scene.random_scene(np.random.default_rng(5), size=128)
     b, h = scene.random_scene(np.random.default_rng(5), size=128)
