@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Collection
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,8 +109,11 @@ class Plan(NamedTuple):
         return 0.0 if self.settings["feed"] == "truth" else TOLERANCE
 
 
-def scenes(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Settings of every scene to build, by name, after the schema; defaults are filled in. Raises `BadConfig`."""
+def scenes(config: dict[str, Any], schema: dict[str, Any], told: Collection[str] = ()) -> dict[str, dict[str, Any]]:
+    """Settings of every scene to build, by name, after the schema; defaults are filled in. Raises `BadConfig`.
+
+    A scene's own keys stand above those for all scenes, and keys `told` on the command line above both.
+    """
     user_settings.check(config, schema)
     common = {k: v for k, v in config.items() if k not in RUN_KEYS}
     listed = config.get("scenes") or {}
@@ -118,7 +122,8 @@ def scenes(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, dict[str
         raise BadConfig(
             "no scene to build: add one under `scenes:` in config.yaml, or give --config scene=NAME raster=FILE"
         )
-    return {str(name): {**DEFAULTS, **(listed.get(name) or {}), **common} for name in wanted}
+    last = {k: v for k, v in common.items() if k in told}
+    return {str(name): {**DEFAULTS, **common, **(listed.get(name) or {}), **last} for name in wanted}
 
 
 def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan:

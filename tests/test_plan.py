@@ -114,6 +114,14 @@ def test_simulated_scene_needs_angles(files):
         plan.plan(name, full, files[0], files[0] / "results")
 
 
+def test_a_scenes_own_settings_stand_above_those_for_all_and_below_the_command_lines():
+    config = {"models": "x", "block": 3, "scenes": {"a": {"models": "y"}, "b": {}}}
+    found = plan.scenes(config, SCHEMA)
+    assert (found["a"]["models"], found["b"]["models"], found["a"]["block"]) == ("y", "x", 3)
+    found = plan.scenes(config, SCHEMA, told=["models"])
+    assert (found["a"]["models"], found["b"]["models"]) == ("x", "x")
+
+
 def test_no_scene_at_all():
     with pytest.raises(BadConfig, match="no scene"):
         plan.scenes({"scenes": {}}, SCHEMA)

@@ -25,7 +25,9 @@ def planned():
     )
     found = {
         name: plans.plan(name, values, Path(workflow.basedir), RESULTS)
-        for name, values in plans.scenes(config, schema).items()
+        for name, values in plans.scenes(
+            config, schema, told=workflow.config_settings.config
+        ).items()
     }
     if not workflow.remote_exec:
         for p in found.values():
