@@ -101,14 +101,20 @@ def tile_images(
 
 
 def view_of(
-    tile: Tile, outputs: dict[str, np.ndarray] | None, contract: dict, margin: int, data: np.ndarray, used: int
+    tile: Tile,
+    image: np.ndarray,
+    outputs: dict[str, np.ndarray] | None,
+    contract: dict,
+    margin: int,
+    data: np.ndarray,
+    used: int,
 ) -> View:
-    """What a network's outputs for a tile (None: not looked at) mean where there is data, with labels from `used` + 1 on."""
+    """What a network's outputs for a tile's image (None: not looked at) mean where there is data; labels from `used` + 1 on."""
     from kibs_steps.models import heads
 
     if outputs is None:
         return View(tile, np.zeros(data.shape, np.int32), np.zeros(0, np.float32), scoring.none(0), used)
-    found = heads.decode_sections(outputs, contract)
+    found = heads.decode_sections(outputs, contract, image)
     labels, shown = np.where(data, found.labels, 0), scoring.none(len(found.scores))
     if contract["head"] == "dense":
         maps = (labels, rims(labels), outputs["roof"][0], outputs["edge"][0], outputs["distance"][0])
@@ -132,7 +138,7 @@ def detect(
     views, used = [], 0
     for tile, image, data in tile_images(rgb, valid, tiling, block, grid):
         seen = core_of(data, tile, tiling.margin).any()
-        views.append(view_of(tile, network(image) if seen else None, contract, tiling.margin, data, used))
+        views.append(view_of(tile, image, network(image) if seen else None, contract, tiling.margin, data, used))
         used += len(views[-1].scores)
     return views
 

@@ -35,7 +35,7 @@ def detect(
         if sections.core_of(data, tile, tiling.margin).any():
             outputs = network(image)
             tables.append(corners.of_tile(heads.decode_corners(outputs, contract), tile, tiling))
-        views.append(sections.view_of(tile, outputs, contract, tiling.margin, data, used))
+        views.append(sections.view_of(tile, image, outputs, contract, tiling.margin, data, used))
         if outputs is not None:
             shown = heads.height_map(outputs, contract)
             heights.append(corners.heights_of_tile(shown, views[-1].labels, tile, tiling))

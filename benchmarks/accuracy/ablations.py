@@ -74,7 +74,10 @@ def judge(run: Ablation, models: dict[str, contracts.Model], sets: dict[str, lis
         thresholds, score = validation.best_decoding(shown, model.contract)
         chosen = {**model.contract, "thresholds": {**model.contract["thresholds"], **thresholds}, "score": score}
         for name, samples in sets.items():
-            found = [heads.alone(heads.decode_sections(maps, chosen), maps, chosen) for maps in raw[name]]
+            found = [
+                heads.alone(heads.decode_sections(maps, chosen, sample.rgb), maps, chosen)
+                for maps, sample in zip(raw[name], samples, strict=True)
+            ]
             figures = validation.judge_sections(found, samples)
             rows.append({"run": run.name, "as": AS["sections"], "set": name, **figures})
     for task in ("corners", "both"):

@@ -104,7 +104,7 @@ class Runner:
         networks = self.networks(sample.geometry)
         start = time.process_time()  # of one thread: what else runs on the machine does not count
         sections = outputs = networks["sections"](rgb)
-        found = heads.decode_sections(sections, models["sections"].contract)
+        found = heads.decode_sections(sections, models["sections"].contract, rgb)
         if models["sections"] is not models["corners"]:
             outputs = networks["corners"](blend(rgb, found.labels, **models["corners"].contract["blend"]))
         corners = heads.decode_corners(outputs, models["corners"].contract)

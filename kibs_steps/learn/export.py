@@ -65,7 +65,7 @@ def contract_of(
     """The contract of a network trained here.
 
     `heights` are mean and standard deviation (m) of the training set's corners; `facts` replace or add fields of the
-    contract: `thresholds` (merged), `metrics`, `score`, and `seed`, `commit`, `about` (what the run was trained on).
+    contract: `thresholds` (merged), `metrics`, `score`, `join`, and `seed`, `commit`, `about` (what the run was trained on).
     """
     tile, margin = tiling(gsd)
     contract: dict[str, Any] = {
@@ -110,7 +110,7 @@ def contract_of(
             "fallback": round(mean, 2),
             "fallback_sigma": round(sigma, 2),
         }
-    contract.update({k: facts[k] for k in ("metrics", "score") if k in facts})
+    contract.update({k: facts[k] for k in ("metrics", "score", "join") if k in facts})
     return contracts.validate(contract, "the new contract")
 
 
@@ -191,7 +191,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--pool", help="simulated tiles, for the mean corner height")
     parser.add_argument("--thresholds", type=json.loads, default={}, help="JSON, replaces thresholds of the contract")
     parser.add_argument(
-        "--like", help="model whose weights the run started from: its thresholds, score and licence hold on"
+        "--like", help="model whose weights the run started from: its thresholds, score, joins and licence hold on"
     )
     parser.add_argument("--metrics", help="report of learn.validation, kept in the contract")
     parser.add_argument("--commit", help="commit of the training code")
@@ -213,7 +213,7 @@ def main(argv: list[str] | None = None) -> None:
     if like:
         kept = {k: v for k, v in like["thresholds"].items() if k not in BY_SIZE or like["gsd"] == gsd}
         facts["thresholds"] = {**kept, **args.thresholds}
-        facts |= {key: like[key] for key in ("score",) if key in like}
+        facts |= {key: like[key] for key in ("score", "join") if key in like}
     if args.commit:
         facts["commit"] = args.commit
     if args.metrics:

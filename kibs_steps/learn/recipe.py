@@ -29,6 +29,7 @@ DEFAULTS = {
     "cities": [],
     "leave_out": [],
     "validation": 0,
+    "joins": 120,
     "patience": 10,
     "shares": None,
     "device": "cpu",
@@ -43,13 +44,14 @@ SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
 
 class Recipe(NamedTuple):
     """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.training` by network,
-    and of `learn.export` by task."""
+    and of `learn.export` by task; scenes that `learn.joins` learns from, by task."""
 
     name: str
     network_of: dict[str, str]
     own: dict[str, dict[str, Any]]
     training: dict[str, list[str]]
     export: dict[str, list[str]]
+    joins: dict[str, int]
 
     def files(self, own: str) -> list[str]:
         """The files of one own data set that are there."""
@@ -105,7 +107,8 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     network_of = {task: network for network, tasks in exports.items() for task in tasks}
     like = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
     export = {task: [f"--like={path}"] if path else [] for task, path in like.items()}
-    return Recipe(str(train["name"]), network_of, own, training, export)
+    joins = {task: train["joins"] if train["family"] == "dense" and task != "corners" else 0 for task in network_of}
+    return Recipe(str(train["name"]), network_of, own, training, export, joins)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:

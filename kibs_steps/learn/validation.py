@@ -195,7 +195,7 @@ def best_decoding(sets: Sequence[Decoded], contract: dict[str, Any]) -> tuple[di
         thresholds = {**contract["thresholds"], "roof": roof, "prominence": prominence}
         labels, evidence, hits = [], [], []
         for _, maps, sample in shown:
-            found = heads.decode_sections(maps, {**contract, "thresholds": thresholds}).labels
+            found = heads.decode_sections(maps, {**contract, "thresholds": thresholds}, sample.rgb).labels
             labels.append(found)
             evidence.append(
                 scoring.evidence(found, rims(found), *(maps[name][0] for name in ("roof", "edge", "distance")))
@@ -210,7 +210,8 @@ def best_decoding(sets: Sequence[Decoded], contract: dict[str, Any]) -> tuple[di
         overlaps = [roof_iou((m["roof"][0] > roof, s.roof) for m, s in zip(*one, strict=True)) for one in sets]
         return sum(overlaps) + sum(map(average_precision, results)), weights
 
-    grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)]
+    rises = (contract["thresholds"]["prominence"],) if "join" in contract else (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in rises]
     tried = {pair: judged(*pair) for pair in grid}
     roof, prominence = max(grid, key=lambda pair: tried[pair][0])
     return {"roof": roof, "prominence": prominence}, tried[roof, prominence][1]
@@ -306,7 +307,10 @@ def main(argv: list[str] | None = None) -> None:
         print(report["thresholds"], report["score"])
     for name, samples in sets.items():
         raw = raw_maps[name]
-        found = [heads.alone(heads.decode_sections(maps, model.contract), maps, model.contract) for maps in raw]
+        found = [
+            heads.alone(heads.decode_sections(maps, model.contract, sample.rgb), maps, model.contract)
+            for maps, sample in zip(raw, samples, strict=True)
+        ]
         report[name] = judge_sections(found, samples)
         if corner_model and name.startswith("simulated"):
             report[name]["corners"] = judge_corners(corner_model, samples, [f.labels for f in found])

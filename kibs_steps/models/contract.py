@@ -19,6 +19,7 @@ import numpy as np
 
 from kibs_steps import cli, store
 from kibs_steps.errors import KibsError
+from kibs_steps.models import joining
 
 KEY = "kibs"
 LARGEST = 2**31 - 1  # bytes: protobuf reads no more
@@ -82,6 +83,10 @@ def validate(contract: Any, source: str) -> dict[str, Any]:
         raise ContractMismatch(f"{source}: a model of corners must say its `heights` bins")
     if contract["task"] == "corners" and "blend" not in contract:
         raise ContractMismatch(f"{source}: a model of corners must say what `blend` it was trained on")
+    if "join" in contract and not joining.chained(contract["join"]["layers"]):
+        raise ContractMismatch(
+            f"{source}: join: the layers do not lead from {len(joining.TRAITS)} traits to one number"
+        )
     heights = contract.get("heights")
     if heights and len(heights["edges"]) != len(heights["centres"]) + 1:
         raise ContractMismatch(f"{source}: heights: {len(heights['centres'])} centres need one edge more")

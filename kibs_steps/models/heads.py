@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from kibs_steps.labels import rims
-from kibs_steps.models import scoring
+from kibs_steps.models import joining, scoring
 
 PROMINENCE = 0.2  # of a section's summit, where the contract does not say
 SMOOTH = 0.5  # px: summits one pixel wide are noise
@@ -36,11 +36,11 @@ class Corners(NamedTuple):
     score: np.ndarray
 
 
-def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Sections:
-    """Sections of one tile from the outputs of either head."""
+def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any], rgb: np.ndarray) -> Sections:
+    """Sections of one tile, rgb uint8 (s, s, 3), from the outputs of either head."""
     if contract["head"] == "dense":
         maps = (outputs["roof"][0], outputs["edge"][0], outputs["distance"][0])
-        return dense_sections(*maps, contract["thresholds"], contract.get("score"))
+        return dense_sections(*maps, contract["thresholds"], contract.get("score"), contract.get("join"), rgb)
     return instance_sections(outputs, contract["tile"], contract["thresholds"])
 
 
@@ -74,24 +74,39 @@ def dense_sections(
     distance: np.ndarray,
     thresholds: dict[str, float],
     score: dict[str, float] | None = None,
+    join: dict[str, Any] | None = None,
+    rgb: np.ndarray | None = None,
 ) -> Sections:
     """Sections where the distance to the rim rises to a summit of its own, flooded over the roof (watershed).
 
-    `roof`, `edge`, `distance` are (s, s) in 0–1. Of all summits of distance − edge those count that rise `prominence` above
-    the pass to a higher one. Every roof area is at least one section. Sections under `min_area` px are given to the neighbour
-    they touch most, or dropped when alone. `score` are the weights of `scoring.traits` that tell how likely a section is right;
-    without them its score is its mean roof probability.
+    `roof`, `edge`, `distance` are (s, s) in 0–1. The basins of all summits of distance − edge are joined by what was learned
+    of them and their image, `rgb` (`joining`, the contract's `join`); without that those summits count that rise
+    `prominence` above the pass to a higher one. Every roof area is at least one section. Sections under `min_area` px are
+    given to the neighbour they touch most, or dropped when alone. `score` are the weights of `scoring.traits` that tell how
+    likely a section is right; without them its score is its mean roof probability.
     """
-    mask = roof > thresholds["roof"]
-    if not mask.any():
-        return Sections(np.zeros(roof.shape, np.int32), np.zeros(0, np.float32))
-    from scipy import ndimage
-
-    level = ndimage.gaussian_filter((distance - edge).astype(np.float32), SMOOTH)
-    basins = flood(summits(level, mask), mask, level)
-    labels = joined_basins(basins, level, thresholds.get("prominence", PROMINENCE))
+    found, level = basins(roof, edge, distance, thresholds)
+    if not found.any():
+        return Sections(found, np.zeros(0, np.float32))
+    if join is not None:
+        labels = joining.sections(found, rgb, roof, edge, level, join)
+    else:
+        labels = joined_basins(found, level, thresholds.get("prominence", PROMINENCE))
     labels = absorb_small(labels, int(thresholds["min_area"]))
     return Sections(labels, scoring.scores(scoring.evidence(labels, rims(labels), roof, edge, distance), score))
+
+
+def basins(
+    roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, thresholds: dict[str, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Watershed basins 1…n (s, s) int32 of the roof, 0 none, and the level (s, s) float32 whose summits they have."""
+    from scipy import ndimage
+
+    mask = roof > thresholds["roof"]
+    level = ndimage.gaussian_filter((distance - edge).astype(np.float32), SMOOTH)
+    if not mask.any():
+        return np.zeros(roof.shape, np.int32), level
+    return flood(summits(level, mask), mask, level), level
 
 
 def summits(level: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -153,15 +168,24 @@ def absorb_small(labels: np.ndarray, min_area: int) -> np.ndarray:
 
     Labels of the result are 1…n in order of first appearance.
     """
-    labels = labels.copy()
+    from scipy import ndimage
+
+    labels = labels.astype(np.int32)
     area = np.bincount(labels.ravel())
     small = [int(i) for i in np.flatnonzero((area > 0) & (area < min_area)) if i > 0]
+    boxes = ndimage.find_objects(labels) if small else []
     for label in sorted(small, key=lambda i: (area[i], i)):
-        own = labels == label
+        place = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in boxes[label - 1])
+        part = labels[place]
+        own = part == label
         rim = cv2.dilate(own.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))).astype(bool) & ~own
-        around = labels[rim]
+        around = part[rim]
         around = around[around > 0]
-        labels[own] = np.bincount(around).argmax() if around.size else 0
+        taker = int(np.bincount(around).argmax()) if around.size else 0
+        part[own] = taker
+        if taker:  # which may be a small one itself
+            both = zip(boxes[label - 1], boxes[taker - 1], strict=True)
+            boxes[taker - 1] = tuple(slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in both)
     return relabelled(labels)
 
 

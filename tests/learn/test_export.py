@@ -35,7 +35,7 @@ def test_onnx_equals_torch(task, zoom, tmp_path):
     for name, value in zip(OUTPUTS[task], expected, strict=True):
         np.testing.assert_allclose(outputs[name], value[0].numpy(), atol=1e-3, err_msg=name)
     if task == "sections":
-        assert heads.decode_sections(outputs, contract).labels.shape == (64, 64)
+        assert heads.decode_sections(outputs, contract, rgb).labels.shape == (64, 64)
     else:
         np.testing.assert_allclose(outputs["height"].sum(0), 1, atol=1e-4)
         assert (np.abs(outputs["offset"]) <= 0.5).all()
@@ -71,7 +71,13 @@ def test_one_run_makes_models_for_two_gsds(tmp_path):
 
 def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
     weights = dict.fromkeys(("log_area", "roof", "rim", "inside", "summit", "rim_length", "bias"), 0.5)
-    like = export.contract_of("sections", thresholds={"roof": 0.66, "min_area": 20}, score=weights)
+    join = {
+        "mean": [0.0] * 23,
+        "spread": [1.0] * 23,
+        "least": 0.5,
+        "layers": [{"weights": [[1.0]] * 23, "bias": [0.0]}],
+    }
+    like = export.contract_of("sections", thresholds={"roof": 0.66, "min_area": 20}, score=weights, join=join)
     export.export(training.network("sections"), tmp_path / "like.onnx", like)
     state = {"average": training.network("sections").state_dict(), "step": 1, "seconds": 1.0}
     for gsd, min_area in ((0.38, 20), (0.5, 6.9)):
@@ -82,6 +88,7 @@ def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
         contract = contracts.load(tmp_path / "new.onnx", "sections").contract
         assert contract["thresholds"] == {"roof": 0.66, "prominence": 0.2, "min_area": min_area, "sure": 0.6}
         assert contract["score"] == weights
+        assert contract["join"] == join
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_boxes_of_detections_that_equal_the_truth_decode_to_it(task):
     outputs["masks"] = np.ones((len(found["boxes"]), 28, 28), np.float32)
     terms = maskrcnn.contract_terms(task, (5.0, 2.0)) | {"tile": SIZE}
     if task == "sections":
-        labels = heads.decode_sections(outputs, terms).labels
+        labels = heads.decode_sections(outputs, terms, one.rgb).labels
         np.testing.assert_array_equal(labels > 0, one.labels * (one.labels < 3) > 0)
         return
     corners = heads.decode_corners(outputs, terms)
@@ -117,7 +117,7 @@ def test_onnx_equals_torch_at_the_papers_tile_size(tmp_path):
         image = torch.from_numpy(contracts.normalise(rgb, contract))
         expected = maskrcnn.OneTile(model)(image)
     np.testing.assert_allclose(outputs["boxes"], expected[0].numpy(), atol=0.02)
-    assert heads.decode_sections(outputs, contract).labels.shape == (maskrcnn.TILE, maskrcnn.TILE)
+    assert heads.decode_sections(outputs, contract, rgb).labels.shape == (maskrcnn.TILE, maskrcnn.TILE)
 
 
 def test_a_wrong_size_export_would_be_noticed(tmp_path):

@@ -31,6 +31,12 @@ def test_another_gsd_is_that_of_the_network_and_of_own_tiles(tmp_path):
     assert not [o for o in recipe.own_options(found.own["town"], "blocks", 0) if "gsd" in o]
 
 
+def test_joins_are_learned_for_networks_that_find_basins(tmp_path):
+    assert recipe.recipe({}, tmp_path).joins == {"both": 120, "sections": 120, "corners": 0}
+    none = {"train": {"family": "maskrcnn", "joins": 9}}
+    assert recipe.recipe(none, tmp_path).joins == {"sections": 0, "corners": 0}
+
+
 def test_free_sources_are_asked_for(tmp_path):
     assert "--free" in recipe.recipe({"train": {"data": "kibs", "free": True}}, tmp_path).training["both"]
     assert "--free" not in recipe.recipe({"train": {"data": "kibs"}}, tmp_path).training["both"]

@@ -79,7 +79,7 @@ def test_the_best_decoding_keeps_apart_what_is_apart():
     thresholds, weights = validation.best_decoding(sets, contract)
     assert thresholds["roof"] < 0.9
     found = heads.decode_sections(
-        sets[0][0][0], {**contract, "thresholds": {**thresholds, "min_area": 12}, "score": weights}
+        sets[0][0][0], {**contract, "thresholds": {**thresholds, "min_area": 12}, "score": weights}, sample.rgb
     )
     match = validation.matches(found.labels, found.scores, labels)
     assert match.hits.all()

@@ -43,7 +43,7 @@ def test_a_tile_alone_is_without_what_is_not_sure():
     roof[labels == 2] = 0.55
     outputs = {"roof": roof[None], "edge": edge[None], "distance": distance[None]}
     contract = {"head": "dense", "thresholds": THRESHOLDS}
-    every = heads.decode_sections(outputs, contract)
+    every = heads.decode_sections(outputs, contract, np.zeros((64, 64, 3), np.uint8))
     assert heads.alone(every, outputs, contract) is every
     left = heads.alone(every, outputs, {**contract, "thresholds": {**THRESHOLDS, "sure": 0.6}})
     np.testing.assert_array_equal(left.labels > 0, (labels == 1) | (labels == 3))

@@ -50,7 +50,7 @@ rule trained:
 
 
 rule exported:
-    """Export a trained network as the ONNX model of one task, with its contract."""
+    """Export a trained network as the ONNX model of one task, with its contract and how basins are joined to sections."""
     input:
         lambda w: f"runs/{w.name}/{RECIPE.network_of[w.task]}/done.json",
     output:
@@ -64,9 +64,12 @@ rule exported:
         LEARN
     params:
         options=lambda w: RECIPE.export[w.task],
+        scenes=lambda w: RECIPE.joins[w.task],
     shell:
         "python -m kibs_steps.learn.export {params.options:q} --checkpoint $(dirname {input:q})/checkpoint.pt --task {wildcards.task}"
         " --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
+        " && (test {params.scenes} = 0 || python -m kibs_steps.learn.joins --model {output:q} --scenes {params.scenes}"
+        " >> {log:q} 2>&1)"
 
 
 rule card:

@@ -1,0 +1,215 @@
+"""How basins of a watershed are joined to sections, learned for a model on scenes its training has not seen.
+
+A policy that is only taught what to do in the beginning meets pairs later that it never saw. So it is taught in rounds: pairs
+met on the way are added to those known, and it is learned anew from all of them (DAgger, Ross et al. 2011). Basins belong to
+what most of their pixels do; pairs of small basins weigh less, as little hangs on them.
+
+In: a dense model for sections with its contract; simulated scenes at the directions it is for. Out: the same model with `join`
+(`models.joining`) and weights of the `score` that fit what is then found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from kibs_steps import cli, store
+from kibs_steps.errors import KibsError
+from kibs_steps.labels import rims
+from kibs_steps.learn import augmentation, calibration, dataset, sources
+from kibs_steps.learn.samples import Sample
+from kibs_steps.models import contract as contracts
+from kibs_steps.models import heads, joining, runtime, scoring
+from kibs_steps.simulate import citymodel
+
+SEED = 454545  # of scenes that no training and no test draws
+HIDDEN = (24, 24)
+ROUNDS = 3
+LEAST = 0.5
+MOST_PAIRS = 1_500_000  # to learn from at once
+LARGE = 400  # px: of two larger basins a pair weighs no more
+VARIED, FORGOTTEN = 0.3, 0.1  # shares of scenes
+STEPS, BATCH, RATE, DECAY = 4000, 2048, 5e-3, 1e-3
+
+
+class NothingToJoin(KibsError):
+    """A model finds no neighbouring basins in any scene."""
+
+
+class Lesson(NamedTuple):
+    """A tile to learn from: the graph of its basins, and how many of their pixels (n, 2 + sections) are unknown, ground, and of
+    each true section."""
+
+    graph: joining.Graph
+    shares: np.ndarray
+
+
+class Pairs(NamedTuple):
+    """Traits (m, 23), whether a pair is one section (m,), weights (m,)."""
+
+    traits: np.ndarray
+    one: np.ndarray
+    weight: np.ndarray
+
+
+def lesson(maps: dict[str, np.ndarray], sample: Sample, thresholds: dict[str, float]) -> Lesson:
+    """What a model's maps of a sample teach."""
+    basins, level = heads.basins(maps["roof"][0], maps["edge"][0], maps["distance"][0], thresholds)
+    truth = np.maximum(sample.labels, -1) + 1
+    shares = np.zeros((int(basins.max(initial=0)) + 1, int(truth.max()) + 1))
+    np.add.at(shares, (basins, truth), 1)
+    return Lesson(joining.graph(basins, sample.rgb, maps["roof"][0], maps["edge"][0], level), shares[1:])
+
+
+def met(lessons: Sequence[Lesson], chance: Callable[[np.ndarray], np.ndarray] | None) -> Pairs:
+    """All pairs met on the way that `chance` leads, or without it those there are in the beginning.
+
+    Pairs of ground alone, and those that touch unknown ground, teach nothing.
+    """
+    found: list[Pairs] = []
+    for graph, shares in lessons:
+
+        def watch(seen: joining.Graph, traits: np.ndarray, of: np.ndarray, shares: np.ndarray = shares) -> None:
+            total = np.zeros((len(seen.basins), shares.shape[1]))
+            np.add.at(total, of, shares)
+            first, second = total.argmax(axis=1)[seen.pairs].T
+            known = (first > 0) & (second > 0) & (np.maximum(first, second) > 1)
+            weight = np.sqrt(np.minimum(seen.basins[seen.pairs, 0].min(axis=1), LARGE))
+            found.append(Pairs(traits[known], (first == second)[known], weight[known]))
+
+        if chance:
+            joining.joined(graph, chance, LEAST, watch)
+        elif len(graph.pairs):
+            watch(graph, joining.traits(graph), np.arange(len(graph.basins)))
+    return together(found)
+
+
+def together(found: Sequence[Pairs]) -> Pairs:
+    """All pairs as one table."""
+    none = Pairs(np.zeros((0, len(joining.TRAITS))), np.zeros(0, bool), np.zeros(0))
+    return Pairs(*(np.concatenate(part) for part in zip(none, *found, strict=True)))
+
+
+def learned(pairs: Pairs, steps: int = STEPS, seed: int = 0) -> dict[str, Any]:
+    """The contract's `join` that fits these pairs. Raises `NothingToJoin` without any."""
+    if not len(pairs.one):
+        raise NothingToJoin("no two basins of known roofs touch: train the network first, or give more scenes")
+    chosen = np.random.default_rng(seed).permutation(len(pairs.one))[:MOST_PAIRS]
+    mean = pairs.traits[chosen].mean(axis=0).round(5)
+    spread = (pairs.traits[chosen].std(axis=0) + 1e-4).round(5)
+    x = torch.from_numpy(np.clip((pairs.traits[chosen] - mean) / spread, -5, 5)).float()
+    y, w = (torch.from_numpy(part[chosen]).float() for part in (pairs.one, pairs.weight))
+    torch.manual_seed(seed)
+    sides = (x.shape[1], *HIDDEN)
+    parts = [part for a, b in itertools.pairwise(sides) for part in (nn.Linear(a, b), nn.ReLU())]
+    network = nn.Sequential(*parts, nn.Linear(HIDDEN[-1], 1))
+    optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, eta_min=RATE / 500)
+    for _ in range(steps):
+        part = torch.randint(len(x), (BATCH,))
+        loss = nn.functional.binary_cross_entropy_with_logits(network(x[part])[:, 0], y[part], reduction="none")
+        optimiser.zero_grad()
+        ((loss * w[part]).sum() / w[part].sum()).backward()
+        optimiser.step()
+        schedule.step()
+    layers = [
+        {"weights": rounded(layer.weight.T), "bias": rounded(layer.bias)}
+        for layer in network
+        if isinstance(layer, nn.Linear)
+    ]
+    return {"mean": mean.tolist(), "spread": spread.tolist(), "layers": layers, "least": LEAST}
+
+
+def rounded(values: torch.Tensor) -> Any:
+    """Nested lists of numbers that are short to write."""
+    return values.detach().double().numpy().round(5).tolist()
+
+
+def policy(lessons: Sequence[Lesson], rounds: int = ROUNDS, steps: int = STEPS, seed: int = 0) -> dict[str, Any]:
+    """The contract's `join`, taught in rounds of so many steps each."""
+    known = met(lessons, None)
+    join = learned(known, steps, seed)
+    for _ in range(rounds):
+        known = together([known, met(lessons, lambda seen, join=join: joining.likely(seen, join))])
+        join = learned(known, steps, seed)
+    return join
+
+
+def score(
+    maps: Sequence[dict[str, np.ndarray]], samples: Sequence[Sample], contract: dict[str, Any]
+) -> dict[str, float]:
+    """Weights of the score of what a contract's decoding finds."""
+    traits, hits = [], []
+    for shown, sample in zip(maps, samples, strict=True):
+        found = heads.decode_sections(shown, contract, sample.rgb).labels
+        proof = scoring.evidence(found, rims(found), *(shown[name][0] for name in ("roof", "edge", "distance")))
+        known = heads.mean_by_label(sample.labels >= 0, found) > 0.5
+        traits.append(scoring.traits(proof[known]))
+        hits.append(calibration.right(found, sample.labels)[known])
+    return calibration.weights(traits, hits)
+
+
+def scene(contract: dict[str, Any], number: int, cities: Sequence[citymodel.CityModel] = ()) -> Sample:
+    """A simulated scene of a model's tile, seen and lit as its contract says it is for, some with a radiometry of their own, some
+    without telling from where."""
+    rng = np.random.default_rng([SEED, number])
+    view, sun = (_direction(contract["trained_on"], name) for name in ("view", "sun"))
+    tall = number % sources.TALL_EVERY == sources.TALL_EVERY - 1
+    sample = dataset.simulated(rng, contract["tile"], view=view, sun=sun, cities=cities, gsd=contract["gsd"], tall=tall)
+    if rng.random() < VARIED:
+        sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
+    return augmentation.without_geometry(sample, rng, FORGOTTEN)
+
+
+def _direction(trained: dict[str, Any], name: str) -> tuple[float, float] | None:
+    """The middle of the directions that a model is for, azimuth and elevation in deg; None for one that is for all azimuths."""
+    azimuth, elevation = trained.get(f"{name}_azimuth"), trained.get(f"{name}_elevation")
+    if not azimuth or not elevation or azimuth[1] - azimuth[0] >= 360:
+        return None
+    return (azimuth[0] + (azimuth[1] - azimuth[0]) % 360 / 2) % 360, sum(elevation) / 2
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Learn how a model's basins are joined to sections, and write it into the model."""
+    import onnx
+
+    parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.joins", description=main.__doc__)
+    parser.add_argument("--model", required=True, help="ONNX file of a dense model for sections, or both; gets `join`")
+    parser.add_argument("--scenes", type=int, default=120, help="simulated scenes of a tile each to learn from")
+    parser.add_argument("--steps", type=int, default=STEPS, help="of learning, each of four times")
+    parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that some of them show parts of")
+    args = parser.parse_args(argv)
+    model = contracts.load(args.model, "sections")
+    if model.contract["head"] != "dense":
+        parser.error(f"{args.model} finds whole sections: there is nothing to join")
+    torch.set_num_threads(1)
+    cities = tuple(map(citymodel.read, args.cities))
+    samples, maps = [], []
+    for number in range(args.scenes):
+        samples.append(scene(model.contract, number, cities))
+        maps.append(runtime.open_network(model, samples[-1].geometry[None], threads=1)(samples[-1].rgb))
+        if number % 20 == 19:
+            print(f"{number + 1} of {args.scenes} scenes", flush=True)
+    lessons = [lesson(shown, sample, model.contract["thresholds"]) for shown, sample in zip(maps, samples, strict=True)]
+    try:
+        contract = {**model.contract, "join": policy(lessons, steps=args.steps)}
+    except NothingToJoin as error:
+        print(f"{args.model} stays as it is: {error}")
+        return
+    contract["score"] = score(maps, samples, contract)
+    proto = onnx.load(args.model)
+    onnx.helper.set_model_props(proto, {contracts.KEY: json.dumps(contracts.validate(contract, args.model))})
+    with store.whole(args.model, summed=False) as temporary:
+        onnx.save(proto, str(temporary))
+    print(f"{args.model}: joins learned on {len(samples)} scenes")
+
+
+if __name__ == "__main__":
+    cli.run(main)

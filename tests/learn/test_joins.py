@@ -1,0 +1,99 @@
+"""A policy learned from tiles whose law is known joins as the law says; a model gets it and decodes by it."""
+
+import numpy as np
+import pytest
+import toy
+
+from kibs_steps.learn import joins
+from kibs_steps.learn.samples import Sample
+from kibs_steps.models import contract as contracts
+from kibs_steps.models import heads, joining
+
+THRESHOLDS = {"roof": 0.5, "min_area": 6}
+
+
+def tile(seed):
+    """Rows of houses cut into summits at random; only some cuts have an edge, and those alone part sections: maps, sample."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((96, 96), np.int32)
+    roof, edge, distance = np.zeros((3, 96, 96))
+    for top in range(4, 90, 18):
+        col, label = 4, int(labels.max()) + 1
+        while col < 84:
+            width = int(rng.integers(6, 12))
+            part = np.s_[top : top + 12, col : col + width]
+            labels[part], roof[part], distance[part] = label, 1, 0.8
+            cut = np.s_[top : top + 12, col + width - 1 : col + width + 1]
+            distance[part] += 0.2 * rng.random()
+            distance[cut] = 0.5
+            if rng.random() < 0.5:
+                edge[cut], label = 0.4, label + 1
+            col += width
+        distance[:, col:][top : top + 12] = edge[:, col:][top : top + 12] = 0
+    maps = {"roof": roof[None], "edge": (edge * roof)[None], "distance": (distance * roof)[None]}
+    sample = Sample.ground(rng.integers(0, 256, (96, 96, 3), dtype=np.uint8))
+    return maps, sample._replace(labels=labels, roof=roof.astype(np.uint8))
+
+
+def test_a_law_is_learned():
+    lessons = [joins.lesson(*tile(seed), THRESHOLDS) for seed in range(12)]
+    join = joins.policy(lessons, rounds=1, steps=600)
+    contracts.validate(toy.contract("sections", join=join), "learned")
+    terms = {"head": "dense", "thresholds": THRESHOLDS, "join": join}
+    right = asked = 0
+    for seed in range(100, 104):
+        maps, sample = tile(seed)
+        found = heads.decode_sections(maps, terms, sample.rgb).labels
+        for label in range(1, sample.labels.max() + 1):
+            own = sample.labels == label
+            best = np.bincount(found[own]).argmax()
+            right += best > 0 and (own & (found == best)).sum() / (own | (found == best)).sum() > 0.8
+            asked += 1
+    assert asked > 60
+    assert right / asked > 0.9
+    again = joins.policy(lessons, rounds=1, steps=600)
+    assert again == join
+
+
+def test_ground_and_unknown_neighbours_teach_nothing():
+    maps, sample = tile(0)
+    basins = joins.lesson(maps, sample, THRESHOLDS)
+    assert len(joins.met([basins], None).one) > 20
+    for value in (0, -1):
+        other = sample._replace(labels=np.full_like(sample.labels, value))
+        assert not len(joins.met([joins.lesson(maps, other, THRESHOLDS)], None).one)
+    with pytest.raises(joins.NothingToJoin, match="no two basins"):
+        joins.policy([])
+
+
+def test_small_basins_weigh_less():
+    basins = np.zeros((40, 40), int)
+    basins[:30, :20], basins[:30, 20:], basins[30:34, :4] = 1, 2, 3
+    flat = np.zeros(basins.shape)
+    graph = joining.graph(basins, np.zeros((40, 40, 3), np.uint8), flat, flat, flat)
+    shares = np.array([[0, 0, 600.0], [0, 0, 600.0], [0, 0, 16.0]])
+    pairs = joins.met([joins.Lesson(graph, shares)], None)
+    np.testing.assert_allclose(pairs.weight, [20.0, 4.0])
+    assert pairs.one.all()
+
+
+def test_a_model_that_finds_nothing_stays_as_it_is(tmp_path, capsys):
+    terms = toy.contract("sections", thresholds={"roof": 1.1, "prominence": 0.2, "min_area": 6})
+    path = toy.save(*toy.section_parts(), tmp_path / "sections.onnx", terms)
+    before = path.read_bytes()
+    joins.main([f"--model={path}", "--scenes=1"])
+    assert path.read_bytes() == before
+    assert "stays as it is: no two basins" in capsys.readouterr().out
+
+
+def test_a_model_learns_to_join(tmp_path):
+    """The toy model sees red roofs, so of simulated scenes little; what it learns it keeps with its network."""
+    path = tmp_path / "set" / "sections.onnx"
+    toy.models(tmp_path / "set")
+    before = contracts.load(path, "sections")
+    joins.main([f"--model={path}", "--scenes=8", "--steps=100"])
+    after = contracts.load(path, "sections")
+    assert {k: v for k, v in after.contract.items() if k not in ("join", "score")} == before.contract
+    assert joining.chained(after.contract["join"]["layers"])
+    assert set(after.contract["score"]) >= {"roof", "bias"}
+    assert after.sha256 != before.sha256
