@@ -114,6 +114,12 @@ def chip_sample(chip: Chip, rng: np.random.Generator, size: int, gsd: float = GS
     )
 
 
+def without_truth(sample: Sample) -> Sample:
+    """The sample as mere context: nothing of it is known."""
+    nothing = np.zeros_like(sample.roof)
+    return sample._replace(labels=nothing.astype(np.int32) - 1, roof=nothing + UNKNOWN, corners_known=nothing)
+
+
 def with_decoys(sample: Sample, other: Sample, rng: np.random.Generator) -> Sample:
     """Patches of `other`'s ground, cut like houses, laid on `sample`'s ground: a cut-out's outline alone is no house."""
     rgb = sample.rgb.copy()

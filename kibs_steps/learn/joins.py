@@ -14,13 +14,14 @@ import argparse
 import itertools
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
-from kibs_steps import cli, store
+from kibs_steps import cli, photographs, store
 from kibs_steps.errors import KibsError
 from kibs_steps.labels import rims
 from kibs_steps.learn import augmentation, calibration, dataset, sources
@@ -156,13 +157,30 @@ def score(
     return calibration.weights(traits, hits)
 
 
-def scene(contract: dict[str, Any], number: int, cities: Sequence[citymodel.CityModel] = ()) -> Sample:
-    """A simulated scene of a model's tile, seen and lit as its contract says it is for, some with a radiometry of their own, some
-    without telling from where."""
+class Stock(NamedTuple):
+    """What scenes may show beside made-up houses: real cities, photographed roofs, and the ground those are laid on."""
+
+    cities: Sequence[citymodel.CityModel] = ()
+    graphs: Sequence[photographs.RoofGraph] = ()
+    chips: Sequence[photographs.Chip] = ()
+
+
+NOTHING = Stock()
+
+
+def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Sample:
+    """A scene of a model's tile, seen and lit as its contract says it is for, some with a radiometry of their own, some without
+    telling from where; of four one shows photographed roofs, if there are any, the others are simulated."""
     rng = np.random.default_rng([SEED, number])
+    if len(stock.graphs) and number % 4 == 3:
+        chip = stock.chips[rng.integers(len(stock.chips))]
+        ground = dataset.without_truth(dataset.chip_sample(chip, rng, contract["tile"], contract["gsd"]))
+        return dataset.pasted_houses(ground, stock.graphs, rng, gsd=contract["gsd"])
     view, sun = (_direction(contract["trained_on"], name) for name in ("view", "sun"))
     tall = number % sources.TALL_EVERY == sources.TALL_EVERY - 1
-    sample = dataset.simulated(rng, contract["tile"], view=view, sun=sun, cities=cities, gsd=contract["gsd"], tall=tall)
+    sample = dataset.simulated(
+        rng, contract["tile"], view=view, sun=sun, cities=stock.cities, gsd=contract["gsd"], tall=tall
+    )
     if rng.random() < VARIED:
         sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
     return augmentation.without_geometry(sample, rng, FORGOTTEN)
@@ -184,16 +202,22 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--model", required=True, help="ONNX file of a dense model for sections, or both; gets `join`")
     parser.add_argument("--scenes", type=int, default=120, help="simulated scenes of a tile each to learn from")
     parser.add_argument("--steps", type=int, default=STEPS, help="of learning, each of four times")
+    parser.add_argument("--data", help="data folder with roof photographs, which some of them show")
+    parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that some of them show parts of")
     args = parser.parse_args(argv)
     model = contracts.load(args.model, "sections")
     if model.contract["head"] != "dense":
         parser.error(f"{args.model} finds whole sections: there is nothing to join")
     torch.set_num_threads(1)
-    cities = tuple(map(citymodel.read, args.cities))
+    stock = Stock(tuple(map(citymodel.read, args.cities)))
+    if args.data:
+        graphs = photographs.read_roof_graphs(args.roofgraph or Path(args.data) / "roofgraph" / "roofgraph.tar")
+        shown = [graph for graph in graphs if not photographs.held_out(graph)]
+        stock = stock._replace(graphs=shown, chips=photographs.read_chips(Path(args.data) / "chips"))
     samples, maps = [], []
     for number in range(args.scenes):
-        samples.append(scene(model.contract, number, cities))
+        samples.append(scene(model.contract, number, stock))
         maps.append(runtime.open_network(model, samples[-1].geometry[None], threads=1)(samples[-1].rgb))
         if number % 20 == 19:
             print(f"{number + 1} of {args.scenes} scenes", flush=True)

@@ -44,14 +44,14 @@ SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
 
 class Recipe(NamedTuple):
     """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.training` by network,
-    and of `learn.export` by task; scenes that `learn.joins` learns from, by task."""
+    and of `learn.export` and, where basins are joined, `learn.joins` by task."""
 
     name: str
     network_of: dict[str, str]
     own: dict[str, dict[str, Any]]
     training: dict[str, list[str]]
     export: dict[str, list[str]]
-    joins: dict[str, int]
+    joins: dict[str, list[str]]
 
     def files(self, own: str) -> list[str]:
         """The files of one own data set that are there."""
@@ -107,7 +107,11 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     network_of = {task: network for network, tasks in exports.items() for task in tasks}
     like = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
     export = {task: [f"--like={path}"] if path else [] for task, path in like.items()}
-    joins = {task: train["joins"] if train["family"] == "dense" and task != "corners" else 0 for task in network_of}
+    shown = [f"--scenes={train['joins']}"]
+    shown += [f"--data={train['data']}"] if train["data"] and not train["free"] else []
+    shown += ["--cities", *map(str, train["cities"])] if train["cities"] else []
+    joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
+    joins = {task: shown if task in joining else [] for task in network_of}
     return Recipe(str(train["name"]), network_of, own, training, export, joins)
 
 

@@ -155,9 +155,7 @@ def photographed(data: Path, source: Path, count: int, size: int, gsd: float = d
     samples = []
     for i in range(count):
         rng = np.random.default_rng([434343, i])
-        ground = dataset.chip_sample(chips[rng.integers(len(chips))], rng, size, gsd)
-        nothing = np.zeros_like(ground.roof)
-        ground = ground._replace(labels=nothing.astype(np.int32) - 1, roof=nothing + UNKNOWN, corners_known=nothing)
+        ground = dataset.without_truth(dataset.chip_sample(chips[rng.integers(len(chips))], rng, size, gsd))
         samples.append(dataset.pasted_houses(ground, graphs, rng, gsd=gsd))
     return samples
 

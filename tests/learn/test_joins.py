@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import toy
 
+from kibs_steps import photographs
 from kibs_steps.learn import joins
 from kibs_steps.learn.samples import Sample
 from kibs_steps.models import contract as contracts
@@ -97,3 +98,30 @@ def test_a_model_learns_to_join(tmp_path):
     assert joining.chained(after.contract["join"]["layers"])
     assert set(after.contract["score"]) >= {"roof", "bias"}
     assert after.sha256 != before.sha256
+
+
+def test_of_four_scenes_one_shows_photographs():
+    graph = photographs.RoofGraph(
+        "a_1", np.full((60, 60, 3), 200, np.uint8), np.array([[10.0, 10], [50, 10], [50, 50], [10, 50]]), [np.arange(4)]
+    )
+    chip = photographs.Chip("inria/a", np.full((200, 200, 3), 90, np.uint8), np.zeros((200, 200), bool), 0.3)
+    terms = toy.contract("sections", tile=128)
+    stock = joins.Stock(graphs=[graph] * 5, chips=[chip])
+    shown = [joins.scene(terms, number, stock) for number in range(8)]
+    assert [(sample.labels < 0).any() for sample in shown] == [False, False, False, True] * 2
+    assert (shown[3].labels > 0).any()
+    again = joins.scene(terms, 3, stock)
+    np.testing.assert_array_equal(again.rgb, shown[3].rgb)
+    assert not any((joins.scene(terms, number).labels < 0).any() for number in range(4))
+
+
+def test_scenes_are_seen_as_the_model_is_told():
+    terms = toy.contract("sections", tile=64)
+    terms["trained_on"] |= {"view_azimuth": [350.0, 10.0], "view_elevation": [60.0, 66.0]}
+    leans = np.array([joins.scene(terms, number).geometry[:2] for number in range(6)])
+    known = leans[leans.any(axis=1)]
+    assert len(known) >= 3
+    elevation = np.degrees(np.arctan2(1 / toy.GSD, np.hypot(*known.T)))
+    np.testing.assert_allclose(elevation, 63, atol=9)  # the GSD varies a little too
+    # Roofs seen from the north lean to the south, which is down.
+    assert (known[:, 1] > 2 * np.abs(known[:, 0])).all()

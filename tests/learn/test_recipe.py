@@ -32,9 +32,13 @@ def test_another_gsd_is_that_of_the_network_and_of_own_tiles(tmp_path):
 
 
 def test_joins_are_learned_for_networks_that_find_basins(tmp_path):
-    assert recipe.recipe({}, tmp_path).joins == {"both": 120, "sections": 120, "corners": 0}
-    none = {"train": {"family": "maskrcnn", "joins": 9}}
-    assert recipe.recipe(none, tmp_path).joins == {"sections": 0, "corners": 0}
+    assert recipe.recipe({}, tmp_path).joins == {"both": ["--scenes=120"], "sections": ["--scenes=120"], "corners": []}
+    for train in ({"family": "maskrcnn", "joins": 9}, {"joins": 0}):
+        assert not any(recipe.recipe({"train": train}, tmp_path).joins.values())
+    given = {"data": "kibs", "cities": ["a.json"], "joins": 5}
+    shown = recipe.recipe({"train": given}, tmp_path).joins["both"]
+    assert shown == ["--scenes=5", "--data=kibs", "--cities", "a.json"]
+    assert "--data=kibs" not in recipe.recipe({"train": {**given, "free": True}}, tmp_path).joins["both"]
 
 
 def test_free_sources_are_asked_for(tmp_path):

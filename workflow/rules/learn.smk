@@ -64,12 +64,12 @@ rule exported:
         LEARN
     params:
         options=lambda w: RECIPE.export[w.task],
-        scenes=lambda w: RECIPE.joins[w.task],
+        joins=lambda w: RECIPE.joins[w.task],
+        learns=lambda w: "yes" if RECIPE.joins[w.task] else "no",
     shell:
         "python -m kibs_steps.learn.export {params.options:q} --checkpoint $(dirname {input:q})/checkpoint.pt --task {wildcards.task}"
         " --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
-        " && (test {params.scenes} = 0 || python -m kibs_steps.learn.joins --model {output:q} --scenes {params.scenes}"
-        " >> {log:q} 2>&1)"
+        " && (test {params.learns} = no || python -m kibs_steps.learn.joins --model {output:q} {params.joins:q} >> {log:q} 2>&1)"
 
 
 rule card:
