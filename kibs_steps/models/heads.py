@@ -79,19 +79,16 @@ def dense_sections(
 ) -> Sections:
     """Sections where the distance to the rim rises to a summit of its own, flooded over the roof (watershed).
 
-    `roof`, `edge`, `distance` are (s, s) in 0–1. The basins of all summits of distance − edge are joined by what was learned
-    of them and their image, `rgb` (`joining`, the contract's `join`); without that those summits count that rise
-    `prominence` above the pass to a higher one. Every roof area is at least one section. Sections under `min_area` px are
+    `roof`, `edge`, `distance` are (s, s) in 0–1. Of all summits of distance − edge those count that rise `prominence` above
+    the pass to a higher one; their basins are joined further by what was learned of them and their image, `rgb` (`joining`,
+    the contract's `join`). Every roof area is at least one section. Sections under `min_area` px are
     given to the neighbour they touch most, or dropped when alone. `score` are the weights of `scoring.traits` that tell how
     likely a section is right; without them its score is its mean roof probability.
     """
     found, level = basins(roof, edge, distance, thresholds)
     if not found.any():
         return Sections(found, np.zeros(0, np.float32))
-    if join is not None:
-        labels = joining.sections(found, rgb, roof, edge, level, join)
-    else:
-        labels = joined_basins(found, level, thresholds.get("prominence", PROMINENCE))
+    labels = found if join is None else joining.sections(found, rgb, roof, edge, level, join)
     labels = absorb_small(labels, int(thresholds["min_area"]))
     return Sections(labels, scoring.scores(scoring.evidence(labels, rims(labels), roof, edge, distance), score))
 
@@ -99,14 +96,15 @@ def dense_sections(
 def basins(
     roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, thresholds: dict[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Watershed basins 1…n (s, s) int32 of the roof, 0 none, and the level (s, s) float32 whose summits they have."""
+    """Watershed basins (s, s) int32 of the summits that count, 0 off the roof, and the level (s, s) float32 they are found in."""
     from scipy import ndimage
 
     mask = roof > thresholds["roof"]
     level = ndimage.gaussian_filter((distance - edge).astype(np.float32), SMOOTH)
     if not mask.any():
         return np.zeros(roof.shape, np.int32), level
-    return flood(summits(level, mask), mask, level), level
+    every = flood(summits(level, mask), mask, level)
+    return joined_basins(every, level, thresholds.get("prominence", PROMINENCE)), level
 
 
 def summits(level: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -151,7 +151,8 @@ def test_layers_that_do_not_fit_are_refused(spoil):
 
 
 def test_decoding_joins_where_the_contract_says_how():
-    """A roof of two summits with a deep pass: two sections by prominence, one by a policy that joins everything."""
+    """A roof of two summits with a deep pass: two sections by prominence, one by a policy that joins everything. What rises less
+    than `prominence` is one in any case."""
     distance = np.zeros((32, 32))
     distance[8:24, 4:14] = distance[8:24, 16:26] = 1.0
     roof = np.zeros((32, 32))
@@ -163,5 +164,8 @@ def test_decoding_joins_where_the_contract_says_how():
     assert heads.decode_sections(outputs, terms | {"join": policy(bias=-1.0)}, rgb).labels.max() == 2
     one = heads.decode_sections(outputs, terms | {"join": policy(bias=1.0)}, rgb)
     np.testing.assert_array_equal(one.labels, roof)
+    shallow = outputs | {"distance": np.maximum(0.9 * roof, distance)[None]}
+    never = heads.decode_sections(shallow, terms | {"join": policy(bias=-1.0)}, rgb)
+    np.testing.assert_array_equal(never.labels, roof)
     nothing = {name: 0 * value for name, value in outputs.items()}
     assert not heads.decode_sections(nothing, terms | {"join": policy()}, rgb).labels.any()
