@@ -44,6 +44,16 @@ def test_the_shipped_models_are_for_two_gsds(gsd, expected):
     assert {model.contract["gsd"] for model in one.values()} == {expected}
 
 
+def test_the_shipped_sets_say_what_may_be_done_with_them():
+    root = Path(__file__).parents[2] / "models"
+    files = sorted(root.rglob("*.onnx"))
+    licences = {path: contract.load(path).contract["trained_on"]["licence"] for path in files}
+    assert {path.relative_to(root).parts[0] for path in files} == {"free", "research"}
+    for path, licence in licences.items():
+        assert licence.startswith("CC BY-SA 4.0" if "free" in path.relative_to(root).parts else "CC BY-NC 4.0")
+    assert sum(path.stat().st_size for path in files) <= 120e6
+
+
 def test_the_set_that_covers_the_view_wins_over_a_better_gsd(tmp_path):
     add(tmp_path / "steep", "", gsd=0.38, view_elevation=[70, 90])
     add(tmp_path / "oblique", "", gsd=0.5, view_elevation=[50, 65])
