@@ -173,7 +173,7 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
     """A scene of a model's tile, seen and lit as its contract says it is for, some with a radiometry of their own, some without
     telling from where; of four one shows photographed roofs, if there are any, the others are simulated."""
     rng = np.random.default_rng([SEED, number])
-    if len(stock.graphs) and number % 4 == 3:
+    if len(stock.graphs) and len(stock.chips) and number % 4 == 3:
         chip = stock.chips[rng.integers(len(stock.chips))]
         ground = dataset.without_truth(dataset.chip_sample(chip, rng, contract["tile"], contract["gsd"]))
         return dataset.pasted_houses(ground, stock.graphs, rng, gsd=contract["gsd"])
@@ -205,6 +205,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=STEPS, help="of learning, each of four times")
     parser.add_argument("--data", help="data folder with roof photographs, which some of them show")
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
+    parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that some of them show parts of")
     args = parser.parse_args(argv)
     model = contracts.load(args.model, "sections")
@@ -215,7 +216,10 @@ def main(argv: list[str] | None = None) -> None:
     if args.data:
         graphs = photographs.read_roof_graphs(args.roofgraph or Path(args.data) / "roofgraph" / "roofgraph.tar")
         shown = [graph for graph in graphs if not photographs.held_out(graph)]
-        stock = stock._replace(graphs=shown, chips=photographs.read_chips(Path(args.data) / "chips"))
+        chips = [
+            c for c in photographs.read_chips(Path(args.data) / "chips") if c.name.split("/")[0] not in args.leave_out
+        ]
+        stock = stock._replace(graphs=shown, chips=chips)
     samples, maps = [], []
     for number in range(args.scenes):
         samples.append(scene(model.contract, number, stock))

@@ -109,7 +109,8 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     export = {task: [f"--like={path}"] if path else [] for task, path in like.items()}
     shown = [f"--scenes={train['joins']}"]
     shown += [f"--data={train['data']}"] if train["data"] and not train["free"] else []
-    shown += ["--cities", *map(str, train["cities"])] if train["cities"] else []
+    for key in ("cities", "leave_out"):
+        shown += [f"--{key.replace('_', '-')}", *map(str, train[key])] if train[key] else []
     joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
     joins = {task: shown if task in joining else [] for task in network_of}
     return Recipe(str(train["name"]), network_of, own, training, export, joins)

@@ -38,6 +38,8 @@ def test_joins_are_learned_for_networks_that_find_basins(tmp_path):
     given = {"data": "kibs", "cities": ["a.json"], "joins": 5}
     shown = recipe.recipe({"train": given}, tmp_path).joins["both"]
     assert shown == ["--scenes=5", "--data=kibs", "--cities", "a.json"]
+    kept = recipe.recipe({"train": {**given, "leave_out": ["inria"]}}, tmp_path).joins["both"]
+    assert kept == [*shown, "--leave-out", "inria"]
     assert "--data=kibs" not in recipe.recipe({"train": {**given, "free": True}}, tmp_path).joins["both"]
 
 
