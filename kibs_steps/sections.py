@@ -37,7 +37,7 @@ BURNT = 0.5  # share of a tile's data
 class View(NamedTuple):
     """What one tile sees: labels (s, s) int32 over its full window, zero outside the data, and a score per label.
 
-    `evidence` (n, 6) is what its core shows of each label (`scoring.evidence`), zero from models that do not tell. Labels begin
+    `evidence` (n, 21) is what its core shows of each label (`scoring.evidence`), zero from models that do not tell. Labels begin
     at `used` + 1; some may lie wholly outside the data.
     """
 
@@ -117,8 +117,9 @@ def view_of(
     found = heads.decode_sections(outputs, contract, image)
     labels, shown = np.where(data, found.labels, 0), scoring.none(len(found.scores))
     if contract["head"] == "dense":
-        maps = (labels, rims(labels), outputs["roof"][0], outputs["edge"][0], outputs["distance"][0])
-        shown = scoring.evidence(*(core_of(m, tile, margin) for m in maps), n=len(found.scores))
+        seen = (core_of(a, tile, margin) for a in (labels, rims(labels), image))
+        maps = {name: core_of(m.transpose(1, 2, 0), tile, margin).transpose(2, 0, 1) for name, m in outputs.items()}
+        shown = scoring.evidence(*seen, maps, len(found.scores), (tile.core.col, tile.core.row))
     return View(tile, np.where(labels > 0, labels + used, 0).astype(np.int32), found.scores, shown, used)
 
 

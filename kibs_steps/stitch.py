@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -79,7 +79,7 @@ class Joined(NamedTuple):
 
 class Parts(NamedTuple):
     """Columns of outlines (px) on their way: piece number (or 0), group, geometry, score, void, split, owner,
-    evidence (n, 6), sums of heights (n, 10)."""
+    evidence (n, 21), sums of heights (n, 10)."""
 
     number: np.ndarray
     group: np.ndarray
@@ -164,10 +164,11 @@ def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
     return Joined(number, groups(len(order), link), stands, row)
 
 
-def united(pieces: Parts, weights: dict[str, float] | None = None, sure: float = 0.0) -> Parts:
+def united(pieces: Parts, scorer: dict[str, Any] | None = None, sure: float = 0.0) -> Parts:
     """Sections from pieces in order of number: the union of every group, then one section per connected part.
 
-    Scores are those of the pieces' evidence together, by the `weights` of the model; without evidence means weighted by area.
+    Scores are those of the pieces' evidence together, by the `scorer` (the contract's `score`); without evidence means
+    weighted by area.
     Every part of a group has the score and the sums of heights of the whole. What is no roof by all its evidence (`sure` is the
     least mean roof probability) is left out.
     """
@@ -192,8 +193,7 @@ def united(pieces: Parts, weights: dict[str, float] | None = None, sure: float =
     if not rows:
         return NOTHING
     geometry, score, void, split, owner, evidence, sums = map(np.array, zip(*rows, strict=True))
-    told = evidence[:, 0] > 0
-    score = np.where(told, scoring.scores(evidence, weights), score)
+    score = np.where(scoring.told(evidence), scoring.scores(evidence, scorer), score)
     none = np.zeros(len(rows), np.int64)
     found = Parts(none, none, shapely.normalize(geometry), score, void, split, owner, evidence, sums)
     return found.take(scoring.sure(evidence, sure))
@@ -321,7 +321,7 @@ def sweep(
     tiling: Tiling,
     tolerance: float,
     rule: str,
-    weights: dict[str, float] | None,
+    scorer: dict[str, Any] | None,
     sure: float,
 ) -> Iterator[tuple[int, pa.Table]]:
     """The sections of each row of blocks (table after `SECTIONS`, by id), row after row."""
@@ -351,7 +351,7 @@ def sweep(
 
             split = scan_order.first_come(complete.geometry, complete.group, complete.split)
             complete = complete._replace(split=split)
-        open_ = Parts.joined([open_, united(complete, weights, sure)])
+        open_ = Parts.joined([open_, united(complete, scorer, sure)])
         limit = (row + 1) * side
         leaves = np.ones(len(open_.group), bool)
         if tolerance > 0 and row != rows[-1]:
@@ -382,17 +382,17 @@ def stitch(
     tolerance: float,
     reach: float,
     rule: str = "overlap",
-    weights: dict[str, float] | None = None,
+    scorer: dict[str, Any] | None = None,
     sure: float = 0.0,
 ) -> Iterator[tuple[Block, pa.Table, pa.Table]]:
     """Every block, row by row, with its sections and corners (tables after `SECTIONS` and `corners.CORNERS`).
 
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
     corners may lie; `rule` as in `sections.links_across`: by `touch` the first piece in scan order also gives the split.
-    `weights` are the model's for scores, `sure` is its least mean roof probability of a section (`models.scoring`).
+    `scorer` is the model's `score`, `sure` is its least mean roof probability of a section (`models.scoring`).
     """
     corners = distinct_corners(pa.concat_tables([CORNERS.empty_table(), *(found.corners(b) for b in blocks)]))
-    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule, weights, sure):
+    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule, scorer, sure):
         of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 1]
         for block in sorted((b for b in blocks if b.row == row), key=lambda b: b.col):
             mine = table.filter(pa.array(of == block.col))

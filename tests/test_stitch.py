@@ -27,7 +27,7 @@ def world(tmp_path_factory):
     return toy.paint(truth, WIDTH, HEIGHT), truth, nets
 
 
-def detections(image, block_side, nets, shuffle=None, tolerance=0.0, weights=None):
+def detections(image, block_side, nets, shuffle=None, tolerance=0.0, scorer=None):
     """Stitched sections and corners of all blocks together, sorted by id."""
     grid = Grid("EPSG:32631", toy.X0, toy.Y0, toy.GSD, image.shape[1], image.shape[0])
     tiling = Tiling(toy.TILE, toy.MARGIN, block_side)
@@ -59,7 +59,7 @@ def detections(image, block_side, nets, shuffle=None, tolerance=0.0, weights=Non
         lambda b, columns: pieces[b].select(columns),
         *(read.__getitem__ for read in (links, seams, found, heights)),
     )
-    _, each, near = zip(*stitch.stitch(blocks, read, grid, tiling, tolerance, 3.0, weights=weights), strict=True)
+    _, each, near = zip(*stitch.stitch(blocks, read, grid, tiling, tolerance, 3.0, scorer=scorer), strict=True)
     return pa.concat_tables(each).sort_by("section_id"), pa.concat_tables(near)
 
 
@@ -89,8 +89,10 @@ def test_heights_of_pieces_add_up_to_those_of_the_section(world):
 def test_scores_are_of_whole_sections(world):
     """However seams cut a section, its evidence is that of all its pixels, and its score follows from that."""
     image, _, nets = world
-    weights = {"bias": -3.0, "log_area": 1.0, "roof": 0.0, "rim": 0.0, "inside": 0.0, "summit": 0.0, "rim_length": 0.0}
-    table, _ = detections(image, 2, nets, weights=weights)
+    n = len(scoring.TRAITS)
+    layer = {"weights": [[100.0 * (name == "area")] for name in scoring.TRAITS], "bias": [-3.0]}  # log px
+    scorer = {"mean": [0.0] * n, "spread": [100.0] * n, "layers": [layer]}
+    table, _ = detections(image, 2, nets, scorer=scorer)
     area = shapely.area(shapely.from_wkb(table["outline"].to_numpy(zero_copy_only=False)))
     np.testing.assert_allclose(table["score"].to_numpy(), 1 / (1 + np.exp(3.0) / area), rtol=1e-5)
 

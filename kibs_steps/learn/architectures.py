@@ -23,12 +23,13 @@ from torch import nn
 from torch.nn import functional as F
 
 OUTPUTS = {
-    "sections": ("roof", "edge", "distance"),
+    "sections": ("roof", "edge", "distance", "slope", "centre"),
     "corners": ("corner", "offset", "height"),
-    "both": ("roof", "edge", "distance", "corner", "offset", "height"),
+    "both": ("roof", "edge", "distance", "slope", "centre", "corner", "offset", "height"),
 }
 CHANNELS = {"roof": 1, "edge": 1, "distance": 1, "corner": 1, "offset": 2}  # maps at stride 1
 GEOMETRY = 6
+CENTRE_UNIT = 10.0  # px
 SURFACES = 5  # kinds of surface (simulate.scene: ground, roof, wall, other, shaded ground)
 # Heights (m) of the sweep: one cell of stride 2 is 1.3 m of height at a lean of 1.5 px per metre.
 SWEPT = (*range(1, 13), 14, 16, 19, 23, 28, 36, 45)
@@ -276,13 +277,15 @@ class Dense(nn.Module):
         bias.fill_(-2.0)
         bias[-4 * CHANNELS["offset"] :] = 0.0
         self.surface = nn.Conv2d(self.widths[0], SURFACES, 1)
+        self.wholes = nn.Sequential(Convolution(self.widths[1], 32), nn.Conv2d(32, 4, 1))
         self.heights = Heights(self.widths[1], self.widths[0], bins)
 
     def logits(self, image: torch.Tensor, geometry: torch.Tensor) -> dict[str, torch.Tensor]:
         """Raw outputs by name: what the losses take.
 
-        Offsets (px) and everything at stride 1 before its activation; `surface` (kinds) at stride 2; `height` (bins) and `slope`
-        (m of height per px of column and row) at stride 4.
+        Offsets (px) and everything at stride 1 before its activation; `surface` (kinds) at stride 2; at stride 4 `slope` and
+        `roof_slope` (m of height per px of column and row, as sections and as heights tell it), `centre` (way to the middle of
+        the section, in CENTRE_UNIT px) and `height` (bins).
         """
         if self.zoom != 1:
             image = resized(image, self.zoom)
@@ -301,8 +304,10 @@ class Dense(nn.Module):
         x = self.refine(x)
         raw = self.full_maps(x)
         raw["surface"] = self.surface(x)
+        if self.task != "corners":
+            raw["slope"], raw["centre"] = self.wholes(stride_4).split(2, dim=1)
         if self.task != "sections":
-            raw["height"], raw["slope"] = self.heights(stride_4, x, raw["surface"], geometry)
+            raw["height"], raw["roof_slope"] = self.heights(stride_4, x, raw["surface"], geometry)
         if self.zoom != 1:
             raw = {name: resized(x, 1 / self.zoom) for name, x in raw.items()}
         return raw
@@ -320,7 +325,12 @@ class Dense(nn.Module):
     def forward(self, image: torch.Tensor, geometry: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Probabilities in the order of OUTPUTS[task]: the exported graph."""
         raw = self.logits(image, geometry)
-        final = {"offset": lambda x: 0.5 * torch.tanh(x), "height": softmax}
+        final = {
+            "offset": lambda x: 0.5 * torch.tanh(x),
+            "height": softmax,
+            "slope": lambda x: resized(x, 4),
+            "centre": lambda x: CENTRE_UNIT * resized(x, 4),
+        }
         return tuple(final.get(name, torch.sigmoid)(raw[name]) for name in OUTPUTS[self.task])
 
 

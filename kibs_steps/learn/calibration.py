@@ -1,19 +1,25 @@
-"""How likely is a found section right? A logistic regression on its traits, fitted on scenes not trained on.
+"""How likely is a found section right? A small network on its traits, fitted on scenes not trained on.
 
-A mean roof probability says little about a section: small ones, and those whose rim has no edge, are wrong more often. The
-weights go into the contract (`score`), and a section's score is then the probability that it meets a true one at IoU ≥ 0.5.
+A mean roof probability says little about a section: small ones, those whose rim has no edge, and those whose pixels see other
+middles than its own are wrong more often. The network goes into the contract (`score`), and a section's score is then the
+probability that it meets a true one at IoU ≥ 0.5.
 
-In: found sections with their traits (`models.scoring.traits`), true labels. Out: weights by trait, and a bias.
+In: a network's maps of samples, sections found in them. Out: the contract's `score`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
-RIDGE = 1.0  # weight of the squared coefficients (in standard deviations of their trait)
+from kibs_steps.labels import rims
+from kibs_steps.learn import fitting
+from kibs_steps.learn.samples import Sample
+from kibs_steps.models import heads, scoring
+
+STEPS = 1500
 
 
 def right(found: np.ndarray, truth: np.ndarray, overlap: float = 0.5) -> np.ndarray:
@@ -25,21 +31,18 @@ def right(found: np.ndarray, truth: np.ndarray, overlap: float = 0.5) -> np.ndar
     return (joint / np.maximum(union, 1))[1:, 1:].max(1, initial=0) >= overlap
 
 
-def weights(traits: Sequence[dict[str, np.ndarray]], hits: Sequence[np.ndarray]) -> dict[str, float]:
-    """Coefficients by trait and the `bias` of the most likely logistic model, with a small penalty on large ones."""
-    names = list(traits[0])
-    x = np.concatenate([np.column_stack([t[name] for name in names]) for t in traits])
-    y = np.concatenate(list(hits)).astype(float)
-    mean, spread = x.mean(0), x.std(0) + 1e-6
-    z = np.column_stack([(x - mean) / spread, np.ones(len(x))])
+def score(
+    shown: Iterable[tuple[dict[str, np.ndarray], Sample]], contract: dict[str, Any], steps: int = STEPS
+) -> dict[str, Any] | None:
+    """The `score` that fits what a contract's decoding finds in maps of samples; None if it finds nothing.
 
-    def cost(w: np.ndarray) -> tuple[float, np.ndarray]:
-        logit = z @ w
-        gradient = z.T @ (1 / (1 + np.exp(-logit)) - y)
-        gradient[:-1] += RIDGE * w[:-1]
-        return float((np.logaddexp(0, logit) - y * logit).sum() + RIDGE / 2 * (w[:-1] ** 2).sum()), gradient
-
-    w = minimize(cost, np.zeros(z.shape[1]), jac=True, method="L-BFGS-B").x
-    slopes = w[:-1] / spread
-    found = {name: round(float(v), 5) for name, v in zip(names, slopes, strict=True)}
-    return {**found, "bias": round(float(w[-1] - slopes @ mean), 5)}
+    Sections mostly on unknown ground say nothing.
+    """
+    traits, hits = [np.zeros((0, len(scoring.TRAITS)))], [np.zeros(0, bool)]
+    for maps, sample in shown:
+        found = heads.decode_sections(maps, contract, sample.rgb).labels
+        known = heads.mean_by_label(sample.labels >= 0, found) > 0.5
+        traits.append(scoring.traits(scoring.evidence(found, rims(found), sample.rgb, maps)[known]))
+        hits.append(right(found, sample.labels)[known])
+    seen, answers = np.concatenate(traits), np.concatenate(hits)
+    return fitting.fitted(seen, answers, np.ones(len(seen)), steps) if len(seen) else None

@@ -42,6 +42,7 @@ def example(sample: Sample, rng: np.random.Generator, blended: bool, task: str =
         "image": (painted(sample, rng) if blended else sample.rgb).transpose(2, 0, 1).copy(),
         "geometry": sample.geometry,
         "surface": targets.surface(sample.surface, SURFACES),
+        "slope": targets.slope(sample.labels, sample.height),
     }
     if task != "corners":
         plain = np.float32(not blended)
@@ -49,6 +50,7 @@ def example(sample: Sample, rng: np.random.Generator, blended: bool, task: str =
             "roof": np.where(blended, np.uint8(targets.IGNORED), sample.roof),
             "edge": targets.edge(sample.labels),
             "distance": targets.distance(sample.labels, DISTANCE_CLIP),
+            "centre": targets.centre(sample.labels),
             "sections_known": plain * (sample.labels >= 0).astype(np.float32) * targets.section_weight(sample.labels),
         }
     if task != "sections":
@@ -56,7 +58,6 @@ def example(sample: Sample, rng: np.random.Generator, blended: bool, task: str =
             "heat": targets.corner_heat(sample.corners, size),
             "offset": targets.corner_offset(sample.corners, size),
             "corners_known": sample.corners_known,
-            "slope": targets.slope(sample.labels, sample.height),
             "corner_height": targets.corner_height(sample.corners, sample.corner_heights, size),
             "roof_height": targets.roof_height(sample.height),
         }

@@ -5,13 +5,12 @@ met on the way are added to those known, and it is learned anew from all of them
 what most of their pixels do; pairs of small basins weigh less, as little hangs on them.
 
 In: a dense model for sections with its contract; simulated scenes at the directions it is for. Out: the same model with `join`
-(`models.joining`) and weights of the `score` that fit what is then found.
+(`models.joining`) and a `score` (`learn.calibration`) that fits what is then found.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,26 +18,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
 
 from kibs_steps import cli, photographs, store
 from kibs_steps.errors import KibsError
-from kibs_steps.labels import rims
-from kibs_steps.learn import augmentation, calibration, dataset, sources
+from kibs_steps.learn import augmentation, calibration, dataset, fitting, sources
 from kibs_steps.learn.samples import Sample
 from kibs_steps.models import contract as contracts
-from kibs_steps.models import heads, joining, runtime, scoring
+from kibs_steps.models import heads, joining, perceptron, runtime
 from kibs_steps.simulate import citymodel
 
 SEED = 454545  # of scenes that no training and no test draws
-HIDDEN = (24, 24)
 ROUNDS = 3
 LEAST = 0.6  # of 0.5 to 0.7 the best in the mean of village, photographs, made-up scenes and two real cities
 PROMINENCE = 0.1  # of a summit: lower ones never count
-MOST_PAIRS = 1_500_000  # to learn from at once
 LARGE = 400  # px: of two larger basins a pair weighs no more
 VARIED, FORGOTTEN = 0.5, 0.2  # shares of scenes
-STEPS, BATCH, RATE, DECAY = 4000, 2048, 5e-3, 1e-3
 
 
 class NothingToJoin(KibsError):
@@ -54,7 +48,7 @@ class Lesson(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Traits (m, 23), whether a pair is one section (m,), weights (m,)."""
+    """Traits (m, 32), whether a pair is one section (m,), weights (m,)."""
 
     traits: np.ndarray
     one: np.ndarray
@@ -67,7 +61,7 @@ def lesson(maps: dict[str, np.ndarray], sample: Sample, thresholds: dict[str, fl
     truth = np.maximum(sample.labels, -1) + 1
     shares = np.zeros((int(basins.max(initial=0)) + 1, int(truth.max()) + 1))
     np.add.at(shares, (basins, truth), 1)
-    return Lesson(joining.graph(basins, sample.rgb, maps["roof"][0], maps["edge"][0], level), shares[1:])
+    return Lesson(joining.graph(basins, sample.rgb, maps, level), shares[1:])
 
 
 def met(lessons: Sequence[Lesson], chance: Callable[[np.ndarray], np.ndarray] | None) -> Pairs:
@@ -99,63 +93,23 @@ def together(found: Sequence[Pairs]) -> Pairs:
     return Pairs(*(np.concatenate(part) for part in zip(none, *found, strict=True)))
 
 
-def learned(pairs: Pairs, steps: int = STEPS, seed: int = 0) -> dict[str, Any]:
+def learned(pairs: Pairs, steps: int = fitting.STEPS, seed: int = 0) -> dict[str, Any]:
     """The contract's `join` that fits these pairs. Raises `NothingToJoin` without any."""
     if not len(pairs.one):
         raise NothingToJoin("no two basins of known roofs touch: train the network first, or give more scenes")
-    chosen = np.random.default_rng(seed).permutation(len(pairs.one))[:MOST_PAIRS]
-    mean = pairs.traits[chosen].mean(axis=0).round(5)
-    spread = (pairs.traits[chosen].std(axis=0) + 1e-4).round(5)
-    x = torch.from_numpy(np.clip((pairs.traits[chosen] - mean) / spread, -5, 5)).float()
-    y, w = (torch.from_numpy(part[chosen]).float() for part in (pairs.one, pairs.weight))
-    torch.manual_seed(seed)
-    sides = (x.shape[1], *HIDDEN)
-    parts = [part for a, b in itertools.pairwise(sides) for part in (nn.Linear(a, b), nn.ReLU())]
-    network = nn.Sequential(*parts, nn.Linear(HIDDEN[-1], 1))
-    optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, eta_min=RATE / 500)
-    for _ in range(steps):
-        part = torch.randint(len(x), (BATCH,))
-        loss = nn.functional.binary_cross_entropy_with_logits(network(x[part])[:, 0], y[part], reduction="none")
-        optimiser.zero_grad()
-        ((loss * w[part]).sum() / w[part].sum()).backward()
-        optimiser.step()
-        schedule.step()
-    layers = [
-        {"weights": rounded(layer.weight.T), "bias": rounded(layer.bias)}
-        for layer in network
-        if isinstance(layer, nn.Linear)
-    ]
-    return {"mean": mean.tolist(), "spread": spread.tolist(), "layers": layers, "least": LEAST}
+    return {**fitting.fitted(pairs.traits, pairs.one, pairs.weight, steps, seed), "least": LEAST}
 
 
-def rounded(values: torch.Tensor) -> Any:
-    """Nested lists of numbers that are short to write."""
-    return values.detach().double().numpy().round(5).tolist()
-
-
-def policy(lessons: Sequence[Lesson], rounds: int = ROUNDS, steps: int = STEPS, seed: int = 0) -> dict[str, Any]:
+def policy(
+    lessons: Sequence[Lesson], rounds: int = ROUNDS, steps: int = fitting.STEPS, seed: int = 0
+) -> dict[str, Any]:
     """The contract's `join`, taught in rounds of so many steps each."""
     known = met(lessons, None)
     join = learned(known, steps, seed)
     for _ in range(rounds):
-        known = together([known, met(lessons, lambda seen, join=join: joining.likely(seen, join))])
+        known = together([known, met(lessons, lambda seen, join=join: perceptron.likely(seen, join))])
         join = learned(known, steps, seed)
     return join
-
-
-def score(
-    maps: Sequence[dict[str, np.ndarray]], samples: Sequence[Sample], contract: dict[str, Any]
-) -> dict[str, float]:
-    """Weights of the score of what a contract's decoding finds."""
-    traits, hits = [], []
-    for shown, sample in zip(maps, samples, strict=True):
-        found = heads.decode_sections(shown, contract, sample.rgb).labels
-        proof = scoring.evidence(found, rims(found), *(shown[name][0] for name in ("roof", "edge", "distance")))
-        known = heads.mean_by_label(sample.labels >= 0, found) > 0.5
-        traits.append(scoring.traits(proof[known]))
-        hits.append(calibration.right(found, sample.labels)[known])
-    return calibration.weights(traits, hits)
 
 
 class Stock(NamedTuple):
@@ -202,7 +156,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.joins", description=main.__doc__)
     parser.add_argument("--model", required=True, help="ONNX file of a dense model for sections, or both; gets `join`")
     parser.add_argument("--scenes", type=int, default=120, help="simulated scenes of a tile each to learn from")
-    parser.add_argument("--steps", type=int, default=STEPS, help="of learning, each of four times")
+    parser.add_argument("--steps", type=int, default=fitting.STEPS, help="of learning, each of four times")
     parser.add_argument("--data", help="data folder with roof photographs, which some of them show")
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
     parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
@@ -233,7 +187,7 @@ def main(argv: list[str] | None = None) -> None:
     except NothingToJoin as error:
         print(f"{args.model} stays as it is: {error}")
         return
-    contract["score"] = score(maps, samples, contract)
+    contract["score"] = calibration.score(zip(maps, samples, strict=True), contract)
     proto = onnx.load(args.model)
     onnx.helper.set_model_props(proto, {contracts.KEY: json.dumps(contracts.validate(contract, args.model))})
     with store.whole(args.model, summed=False) as temporary:

@@ -11,8 +11,10 @@ import torch
 from torch.nn import functional as F
 
 from kibs_steps.learn import targets
+from kibs_steps.learn.architectures import CENTRE_UNIT
 
 EDGES, CENTRES = targets.height_bins()
+STEEPEST = 1.5  # m of height per px: faces that turn away from the view rise endlessly
 
 Batch = dict[str, torch.Tensor]
 
@@ -35,10 +37,16 @@ def section_losses(raw: Batch, batch: Batch) -> Batch:
     far_error = (torch.sigmoid(far) - batch["distance"]).abs()
     far_entropy = F.binary_cross_entropy_with_logits(far, batch["distance"], reduction="none")
     total = weight.sum().clamp(min=1)
+    half = targets.HEIGHT_STRIDE // 2
+    cells = (
+        torch.isfinite(batch["centre"]) * known[:, None, half :: targets.HEIGHT_STRIDE, half :: targets.HEIGHT_STRIDE]
+    )
+    centre_error = (raw["centre"] - torch.nan_to_num(batch["centre"]) / CENTRE_UNIT).abs() * cells
     return {
         "roof": (entropy * judged).sum() / judged.sum().clamp(min=1) + 0.5 * dice,
         "edge": (edge_entropy * known * (1 + 3 * edge)).sum() / known.sum().clamp(min=1),
         "distance": (weight * (far_error + 0.5 * far_entropy)).sum() / total,
+        "centre": 0.5 * centre_error.sum() / cells.sum().clamp(min=1),
     }
 
 
@@ -67,8 +75,19 @@ def surface_losses(raw: Batch, batch: Batch) -> Batch:
     return {"surface": surface.sum() / known.sum().clamp(min=1)}
 
 
+def slope_losses(raw: Batch, batch: Batch) -> Batch:
+    """Loss terms of the slope of roofs, which tells sections apart and goes with heights."""
+    sloped = torch.isfinite(batch["slope"])
+    truth = torch.nan_to_num(batch["slope"]).clamp(-STEEPEST, STEEPEST)
+    return {
+        name: 3 * ((raw[name] - truth).abs() * sloped).sum() / sloped.sum().clamp(min=1)
+        for name in ("slope", "roof_slope")
+        if name in raw
+    }
+
+
 def height_losses(raw: Batch, batch: Batch) -> Batch:
-    """Loss terms of heights (their distribution and its mean) and slopes."""
+    """Loss terms of heights: their distribution and its mean."""
     log_height = F.log_softmax(raw["height"], dim=1)
     centres = torch.from_numpy(CENTRES).float().to(log_height.device)
 
@@ -79,19 +98,16 @@ def height_losses(raw: Batch, batch: Batch) -> Batch:
         off = F.smooth_l1_loss(chosen.exp() @ centres, height[cells], reduction="sum", beta=1.0)
         return (0.2 * off - (torch.from_numpy(soft).to(chosen.device) * chosen).sum()) / max(len(cells[0]), 1)
 
-    sloped = torch.isfinite(batch["slope"])
-    slope_error = (raw["slope"] - torch.nan_to_num(batch["slope"]).clamp(-1.5, 1.5)).abs() * sloped
     return {
         "height": 0.4 * height_loss(batch["corner_height"]),
         "roof_height": 0.6 * height_loss(batch["roof_height"]),
-        "slope": 3 * slope_error.sum() / sloped.sum().clamp(min=1),
     }
 
 
 TERMS = {
-    "sections": (section_losses, surface_losses),
-    "corners": (corner_losses, surface_losses, height_losses),
-    "both": (section_losses, corner_losses, surface_losses, height_losses),
+    "sections": (section_losses, surface_losses, slope_losses),
+    "corners": (corner_losses, surface_losses, height_losses, slope_losses),
+    "both": (section_losses, corner_losses, surface_losses, height_losses, slope_losses),
 }
 
 

@@ -68,6 +68,25 @@ def slope(labels: np.ndarray, height: np.ndarray) -> np.ndarray:
     return plane[:, middle].astype(np.float32)
 
 
+def centre(labels: np.ndarray, farthest: float = 64.0) -> np.ndarray:
+    """Way (col, row) px from the cells' middles to the middle of their section, no longer than `farthest`, float32 (2, h/4, w/4).
+
+    NaN off sections and on those that the tile cuts: their middle is not known.
+    """
+    known = np.maximum(labels, 0)
+    n = int(known.max(initial=0)) + 1
+    row, col = (a.ravel() + 0.5 for a in np.mgrid[: labels.shape[0], : labels.shape[1]])
+    count = np.maximum(np.bincount(known.ravel(), minlength=n), 1)
+    middle = np.stack([np.bincount(known.ravel(), place, n) / count for place in (col, row)])
+    cut = np.unique(np.concatenate([known[0], known[-1], known[:, 0], known[:, -1]]))
+    middle[:, np.append(cut, 0)] = np.nan
+    half = HEIGHT_STRIDE // 2
+    at = known[half::HEIGHT_STRIDE, half::HEIGHT_STRIDE]
+    rows, cols = np.mgrid[half : labels.shape[0] : HEIGHT_STRIDE, half : labels.shape[1] : HEIGHT_STRIDE]
+    way = middle[:, at] - np.stack([cols, rows])
+    return (way * np.minimum(1, farthest / np.maximum(np.hypot(*way), 1e-6))).astype(np.float32)
+
+
 def edge(labels: np.ndarray) -> np.ndarray:
     """uint8 (h, w): 1 on rims, 0 elsewhere, IGNORED where sections are unknown (label −1)."""
     target = rims(labels).astype(np.uint8)

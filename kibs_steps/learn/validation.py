@@ -24,7 +24,7 @@ from kibs_steps.labels import rims
 from kibs_steps.learn import calibration, dataset
 from kibs_steps.learn.samples import UNKNOWN, Sample
 from kibs_steps.models import contract as contracts
-from kibs_steps.models import heads, runtime, scoring
+from kibs_steps.models import heads, runtime
 
 SMALLEST = 12  # px: smaller true sections are neither asked for nor held against a model
 
@@ -181,38 +181,31 @@ def judge_sections(
     }
 
 
-def best_decoding(sets: Sequence[Decoded], contract: dict[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
-    """Thresholds `roof` and `prominence`, and weights of the sections' score (`learn.calibration`), by trying a grid.
+def best_decoding(sets: Sequence[Decoded], contract: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any] | None]:
+    """Thresholds `roof` and `prominence` by trying a grid, and the `score` that fits them (`learn.calibration`).
 
-    Every pair is judged with the weights that fit it, by the sum of roof IoU and AP at overlap 0.5, the mean over the sets of
-    (maps, samples): a small set counts as much as a large one. Sections mostly on unknown ground say nothing of the weights.
+    Every pair is judged by the sum of roof IoU and AP at overlap 0.5 (by mean roof probability), the mean over the sets of
+    (maps, samples): a small set counts as much as a large one.
     """
-    shown = [(number, *pair) for number, one in enumerate(sets) for pair in zip(*one, strict=True)]
 
-    def judged(roof: float, prominence: float) -> tuple[float, dict[str, float]]:
+    def decoding(roof: float, prominence: float) -> dict[str, Any]:
         thresholds = {**contract["thresholds"], "roof": roof, "prominence": prominence}
-        labels, evidence, hits = [], [], []
-        for _, maps, sample in shown:
-            found = heads.decode_sections(maps, {**contract, "thresholds": thresholds}, sample.rgb).labels
-            labels.append(found)
-            evidence.append(
-                scoring.evidence(found, rims(found), *(maps[name][0] for name in ("roof", "edge", "distance")))
-            )
-            known = heads.mean_by_label(sample.labels >= 0, found) > 0.5
-            hits.append((known, calibration.right(found, sample.labels)))
-        traits = [scoring.traits(proof[known]) for proof, (known, _) in zip(evidence, hits, strict=True)]
-        weights = calibration.weights(traits, [right[known] for known, right in hits])
-        results: list[list[Match]] = [[] for _ in sets]
-        for (number, _, sample), found, proof in zip(shown, labels, evidence, strict=True):
-            results[number].append(matches(found, scoring.scores(proof, weights), sample.labels))
-        overlaps = [roof_iou((m["roof"][0] > roof, s.roof) for m, s in zip(*one, strict=True)) for one in sets]
-        return sum(overlaps) + sum(map(average_precision, results)), weights
+        return {**{k: v for k, v in contract.items() if k != "score"}, "thresholds": thresholds}
+
+    def judged(roof: float, prominence: float) -> float:
+        total, terms = 0.0, decoding(roof, prominence)
+        for one in sets:
+            shown = list(zip(*one, strict=True))
+            found = [heads.decode_sections(maps, terms, sample.rgb) for maps, sample in shown]
+            results = [matches(f.labels, f.scores, s.labels) for f, (_, s) in zip(found, shown, strict=True)]
+            total += average_precision(results) + roof_iou((m["roof"][0] > roof, s.roof) for m, s in shown)
+        return total
 
     rises = (contract["thresholds"]["prominence"],) if "join" in contract else (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
     grid = [(roof, rise) for roof in (0.35, 0.45, 0.55, 0.65) for rise in rises]
-    tried = {pair: judged(*pair) for pair in grid}
-    roof, prominence = max(grid, key=lambda pair: tried[pair][0])
-    return {"roof": roof, "prominence": prominence}, tried[roof, prominence][1]
+    roof, prominence = max(grid, key=lambda pair: judged(*pair))
+    every = (pair for one in sets for pair in zip(*one, strict=True))
+    return {"roof": roof, "prominence": prominence}, calibration.score(every, decoding(roof, prominence))
 
 
 def judge_corners(
@@ -280,9 +273,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=12, help="simulated and pasted scenes each")
     parser.add_argument("--out", required=True, help="report, JSON")
     parser.add_argument("--pictures", help="folder for one picture per test set")
-    parser.add_argument(
-        "--choose", action="store_true", help="first choose thresholds and the weights of the score on these sets"
-    )
+    parser.add_argument("--choose", action="store_true", help="first choose thresholds and fit the score on these sets")
     args = parser.parse_args(argv)
     model = contracts.load(args.sections, "sections")
     corner_model = contracts.load(args.corners, "corners") if args.corners else None

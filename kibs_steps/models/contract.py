@@ -19,7 +19,7 @@ import numpy as np
 
 from kibs_steps import cli, store
 from kibs_steps.errors import KibsError
-from kibs_steps.models import joining
+from kibs_steps.models import joining, perceptron, scoring
 
 KEY = "kibs"
 LARGEST = 2**31 - 1  # bytes: protobuf reads no more
@@ -83,10 +83,12 @@ def validate(contract: Any, source: str) -> dict[str, Any]:
         raise ContractMismatch(f"{source}: a model of corners must say its `heights` bins")
     if contract["task"] == "corners" and "blend" not in contract:
         raise ContractMismatch(f"{source}: a model of corners must say what `blend` it was trained on")
-    if "join" in contract and not joining.chained(contract["join"]["layers"]):
-        raise ContractMismatch(
-            f"{source}: join: the layers do not lead from {len(joining.TRAITS)} traits to one number"
-        )
+    for name, traits in (("join", joining.TRAITS), ("score", scoring.TRAITS)):
+        if name in contract and not perceptron.leads(contract[name], len(traits)):
+            raise ContractMismatch(
+                f"{source}: {name}: its layers do not lead from {len(traits)} traits to one number. Make it anew with "
+                "kibs_steps.learn.joins"
+            )
     heights = contract.get("heights")
     if heights and len(heights["edges"]) != len(heights["centres"]) + 1:
         raise ContractMismatch(f"{source}: heights: {len(heights['centres'])} centres need one edge more")

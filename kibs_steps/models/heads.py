@@ -39,8 +39,7 @@ class Corners(NamedTuple):
 def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any], rgb: np.ndarray) -> Sections:
     """Sections of one tile, rgb uint8 (s, s, 3), from the outputs of either head."""
     if contract["head"] == "dense":
-        maps = (outputs["roof"][0], outputs["edge"][0], outputs["distance"][0])
-        return dense_sections(*maps, contract["thresholds"], contract.get("score"), contract.get("join"), rgb)
+        return dense_sections(outputs, contract["thresholds"], rgb, contract.get("score"), contract.get("join"))
     return instance_sections(outputs, contract["tile"], contract["thresholds"])
 
 
@@ -51,10 +50,7 @@ def alone(found: Sections, outputs: dict[str, np.ndarray], contract: dict[str, A
     """
     if contract["head"] != "dense" or "sure" not in contract["thresholds"]:
         return found
-    maps = (outputs[name][0] for name in ("roof", "edge", "distance"))
-    stays = scoring.sure(
-        scoring.evidence(found.labels, rims(found.labels), *maps, n=len(found.scores)), contract["thresholds"]["sure"]
-    )
+    stays = mean_by_label(outputs["roof"][0], found.labels, len(found.scores)) >= contract["thresholds"]["sure"]
     number = np.append(0, np.where(stays, np.cumsum(stays), 0)).astype(np.int32)
     return Sections(number[found.labels], found.scores[stays])
 
@@ -69,28 +65,27 @@ def decode_corners(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> 
 
 
 def dense_sections(
-    roof: np.ndarray,
-    edge: np.ndarray,
-    distance: np.ndarray,
+    maps: dict[str, np.ndarray],
     thresholds: dict[str, float],
-    score: dict[str, float] | None = None,
+    rgb: np.ndarray,
+    score: dict[str, Any] | None = None,
     join: dict[str, Any] | None = None,
-    rgb: np.ndarray | None = None,
 ) -> Sections:
     """Sections where the distance to the rim rises to a summit of its own, flooded over the roof (watershed).
 
-    `roof`, `edge`, `distance` are (s, s) in 0–1. Of all summits of distance − edge those count that rise `prominence` above
-    the pass to a higher one; their basins are joined further by what was learned of them and their image, `rgb` (`joining`,
-    the contract's `join`). Every roof area is at least one section. Sections under `min_area` px are
-    given to the neighbour they touch most, or dropped when alone. `score` are the weights of `scoring.traits` that tell how
-    likely a section is right; without them its score is its mean roof probability.
+    `maps` (C, s, s) are `roof`, `edge`, `distance` in 0–1 and perhaps `slope` and `centre`. Of all summits of distance − edge
+    those count that rise `prominence` above the pass to a higher one; their basins are joined further by what was learned of them
+    and their image, `rgb` (`joining`, the contract's `join`). Every roof area is at least one section. Sections under
+    `min_area` px are given to the neighbour they touch most, or dropped when alone. `score` is the network that tells from
+    `scoring.traits` how likely a section is right; without it its score is its mean roof probability.
     """
+    roof, edge, distance = (maps[name][0] for name in ("roof", "edge", "distance"))
     found, level = basins(roof, edge, distance, thresholds)
     if not found.any():
         return Sections(found, np.zeros(0, np.float32))
-    labels = found if join is None else joining.sections(found, rgb, roof, edge, level, join)
+    labels = found if join is None else joining.sections(found, rgb, maps, level, join)
     labels = absorb_small(labels, int(thresholds["min_area"]))
-    return Sections(labels, scoring.scores(scoring.evidence(labels, rims(labels), roof, edge, distance), score))
+    return Sections(labels, scoring.scores(scoring.evidence(labels, rims(labels), rgb, maps), score))
 
 
 def basins(

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# Sums over a basin's pixels, and its highest level; over the pixel edges between two, and the highest pass.
-BASIN = ("area", "x", "y", "xx", "xy", "yy", "red", "green", "blue", "bright²", "roof", "edge", "summit")
+from kibs_steps.models import perceptron, regions
+
+# Sums over the pixel edges between two basins, and the highest pass.
 RIM = ("length", "x", "y", "xx", "xy", "yy", "edge", "level", "contrast", "pass")
 TRAITS = (
     "rim edge",  # means along the common rim
@@ -41,6 +42,15 @@ TRAITS = (
     "roof most",
     "edge least",
     "edge most",
+    "slope apart",  # m per px, as the network sees the two planes
+    "slope told apart",  # in standard deviations
+    "slope least",
+    "slope most",
+    "aims apart",  # of the middles that pixels see, in sides of a square of both areas
+    "aims told apart",  # in standard deviations
+    "aim off together",  # of the middle that pixels see from the shape's own, in sides of a square of its area
+    "aim off least",
+    "aim off most",
     "fill together",  # share of the ellipse of inertia
     "fill least",
     "fill most",
@@ -49,8 +59,8 @@ STEPS = 60  # more than any tile takes: each joins at least the likeliest pair, 
 
 
 class Graph(NamedTuple):
-    """Basins, as sums (n, 13), and pairs of neighbours (m, 2), the smaller number first, counted from 0, with sums of their
-    common rim (m, 10): columns BASIN and RIM, float64."""
+    """Basins, as sums (n, 19), and pairs of neighbours (m, 2), the smaller number first, counted from 0, with sums of their
+    common rim (m, 10): columns regions.COLUMNS and RIM, float64."""
 
     basins: np.ndarray
     pairs: np.ndarray
@@ -58,35 +68,17 @@ class Graph(NamedTuple):
 
 
 def sections(
-    basins: np.ndarray, rgb: np.ndarray, roof: np.ndarray, edge: np.ndarray, level: np.ndarray, join: dict[str, Any]
+    basins: np.ndarray, rgb: np.ndarray, maps: dict[str, np.ndarray], level: np.ndarray, join: dict[str, Any]
 ) -> np.ndarray:
     """Sections (s, s) int32, 0 none, of basins 1…n (s, s) by the contract's `join`; image and maps as in `graph`."""
-    found = joined(graph(basins, rgb, roof, edge, level), lambda seen: likely(seen, join), join["least"])
+    found = joined(graph(basins, rgb, maps, level), lambda seen: perceptron.likely(seen, join), join["least"])
     return np.append(0, found + 1)[basins].astype(np.int32)
 
 
-def graph(basins: np.ndarray, rgb: np.ndarray, roof: np.ndarray, edge: np.ndarray, level: np.ndarray) -> Graph:
-    """Sums of basins 1…n (s, s) and of their common rims: rgb uint8 (s, s, 3), roof and edge in 0–1, `level` the map whose
-    summits they are."""
-    n = int(basins.max(initial=0))
-    row, col = np.nonzero(basins)
-    at = basins[row, col]
-    colour = rgb[row, col] / 255.0
-    bright = colour.mean(axis=1)
-    x, y = col.astype(np.float64), row.astype(np.float64)
-    columns = (
-        x,
-        y,
-        x * x,
-        x * y,
-        y * y,
-        *colour.T,
-        bright * bright,
-        *(m[row, col].astype(float) for m in (roof, edge)),
-    )
-    sums = [np.bincount(at, minlength=n + 1), *(np.bincount(at, values, n + 1) for values in columns)]
-    summit = np.full(n + 1, -np.inf)
-    np.maximum.at(summit, at, level[row, col].astype(np.float64))
+def graph(basins: np.ndarray, rgb: np.ndarray, maps: dict[str, np.ndarray], level: np.ndarray) -> Graph:
+    """Sums of basins 1…n (s, s) and of their common rims: rgb uint8 (s, s, 3), a network's `maps` (C, s, s), `level` (s, s) that
+    whose summits they are."""
+    edge = maps["edge"][0]
     grey = rgb.mean(axis=2) / 255.0
     pairs, rims = [], []
     for down, right in ((1, 0), (0, 1)):
@@ -99,9 +91,8 @@ def graph(basins: np.ndarray, rgb: np.ndarray, roof: np.ndarray, edge: np.ndarra
         contrast = np.abs(grey[here] - grey[there])
         along = np.maximum(edge[here], edge[there])
         rims.append(np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y, along, height, contrast, height]))
-    return Graph(
-        np.column_stack([*sums, summit])[1:], *_gathered(np.concatenate(pairs), np.concatenate(rims).astype(np.float64))
-    )
+    sums = regions.sums(basins, rgb, maps, level)
+    return Graph(sums, *_gathered(np.concatenate(pairs), np.concatenate(rims).astype(np.float64)))
 
 
 def _gathered(pairs: np.ndarray, rims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,10 +109,7 @@ def _gathered(pairs: np.ndarray, rims: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def merged(seen: Graph, number: np.ndarray) -> Graph:
     """The graph once basins of equal `number` (n,), counted from 0, are one."""
-    sums = np.zeros((int(number.max(initial=-1)) + 1, len(BASIN)))
-    np.add.at(sums, number, seen.basins)
-    sums[:, -1] = -np.inf
-    np.maximum.at(sums[:, -1], number, seen.basins[:, -1])
+    sums = regions.merged(seen.basins, number, int(number.max(initial=-1)) + 1)
     pairs = np.sort(number[seen.pairs], axis=1)
     apart = pairs[:, 0] != pairs[:, 1]
     return Graph(sums, *_gathered(pairs[apart], seen.rims[apart]))
@@ -135,7 +123,7 @@ def joined(
 ) -> np.ndarray:
     """The section (n,), counted from 0, of every basin of a graph.
 
-    `chance` tells from traits (m, 23) how likely pairs are one section; those of at least `least` may join. `watch` is called
+    `chance` tells from traits (m, 32) how likely pairs are one section; those of at least `least` may join. `watch` is called
     before every step with the graph, its traits and the section of every basin so far.
     """
     of = np.arange(len(seen.basins))
@@ -166,19 +154,26 @@ def partners(pairs: np.ndarray, chance: np.ndarray, n: int, least: float) -> np.
 
 
 def traits(seen: Graph) -> np.ndarray:
-    """What tells whether pairs of neighbours are one section, (m, 23), columns TRAITS; the same whichever is named first."""
+    """What tells whether pairs of neighbours are one section, (m, 32), columns TRAITS; the same whichever is named first."""
     one, other = seen.basins[seen.pairs[:, 0]], seen.basins[seen.pairs[:, 1]]
     length = seen.rims[:, 0]
     areas = np.sort(np.stack([one[:, 0], other[:, 0]]), axis=0)
     summits = np.sort(np.stack([one[:, -1], other[:, -1]]), axis=0)
-    means = [side[:, 6:12] / side[:, :1] for side in (one, other)]
-    apart = means[0][:, :3] - means[1][:, :3]
+    apart, tilted, aimed = (
+        regions.mean(one, columns) - regions.mean(other, columns)
+        for columns in (regions.COLOUR, regions.SLOPE, regions.AIM)
+    )
     brightness = apart.mean(axis=1)
-    varied = np.stack([np.maximum(m[:, 3] - m[:, :3].mean(axis=1) ** 2, 0) for m in means])
-    long, short = spread(seen.rims)
+    varied, warped, scattered = (
+        np.stack([variance(one), variance(other)])
+        for variance in (regions.brightness_variance, regions.slope_variance, regions.aim_variance)
+    )
+    whole = one + other
+    tilt, aim = np.linalg.norm(tilted, axis=1), np.linalg.norm(aimed, axis=1)
+    long, short = regions.spread(seen.rims)
 
-    def both(values: np.ndarray) -> np.ndarray:
-        return np.sort(values, axis=0)
+    def both(of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        return np.sort(np.stack([of(one), of(other)]), axis=0)
 
     return np.column_stack(
         [
@@ -194,47 +189,17 @@ def traits(seen: Graph) -> np.ndarray:
             np.sqrt(((apart - brightness[:, None]) ** 2).sum(axis=1)),
             np.abs(brightness) / np.sqrt(varied.sum(axis=0) + 1e-4),
             seen.rims[:, 8] / length,
-            *both(np.sqrt(varied)),
-            *both(np.stack([m[:, 4] for m in means])),
-            *both(np.stack([m[:, 5] for m in means])),
-            fill(one + other),
-            *both(np.stack([fill(one), fill(other)])),
+            *np.sort(np.sqrt(varied), axis=0),
+            *both(lambda side: regions.mean(side, "roof")),
+            *both(lambda side: regions.mean(side, "edge")),
+            tilt,
+            tilt / np.sqrt(warped.sum(axis=0) + 1e-4),
+            *both(lambda side: np.linalg.norm(regions.mean(side, regions.SLOPE), axis=1)),
+            aim / np.sqrt(areas.sum(axis=0)),
+            aim / np.sqrt(scattered.sum(axis=0) + 1),
+            regions.aim_off(whole),
+            *both(regions.aim_off),
+            regions.fill(whole),
+            *both(regions.fill),
         ]
     )
-
-
-def spread(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Greater and smaller standard deviation (px) of the places of pixels, squares of 1 px, from sums (m, ≥ 6): number, x, y, xx,
-    xy, yy."""
-    number = sums[:, 0]
-    x, y, xx, xy, yy = (sums[:, k] / number for k in range(1, 6))
-    xx, xy, yy = xx - x * x, xy - x * y, yy - y * y
-    middle, off = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
-    return np.sqrt(np.maximum(middle + off, 0) + 1 / 12), np.sqrt(np.maximum(middle - off, 0) + 1 / 12)
-
-
-def fill(sums: np.ndarray) -> np.ndarray:
-    """How much of its ellipse of inertia a shape covers: 1 for an ellipse, 3/π (0.95) for a rectangle, little for what
-    has arms."""
-    long, short = spread(sums)
-    return sums[:, 0] / (4 * np.pi * long * short)
-
-
-def chained(layers: list[dict[str, Any]]) -> bool:
-    """Whether layers lead from the traits to one number, each taking what the one before gives."""
-    sides = [len(TRAITS)]
-    for layer in layers:
-        rows, width = len(layer["weights"]), len(layer["bias"])
-        if rows != sides[-1] or any(len(row) != width for row in layer["weights"]):
-            return False
-        sides.append(width)
-    return sides[-1] == 1
-
-
-def likely(seen: np.ndarray, join: dict[str, Any]) -> np.ndarray:
-    """How likely pairs are one section, (m,), from their traits (m, 23), by the network of a contract's `join`."""
-    x = np.clip((seen - join["mean"]) / join["spread"], -5, 5)
-    *hidden, last = join["layers"]
-    for layer in hidden:
-        x = np.maximum(x @ np.asarray(layer["weights"]) + layer["bias"], 0)
-    return 1 / (1 + np.exp(-(x @ np.asarray(last["weights"]) + last["bias"])[:, 0]))

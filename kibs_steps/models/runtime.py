@@ -34,6 +34,8 @@ PROVIDERS: dict[str, tuple[str, str, dict[str, object]]] = {  # onnxruntime's na
     "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino", {"device_type": "CPU", "precision": "FP32"}),
 }
 
+DIRECTED = ("offset", "slope", "centre")  # maps whose two channels are a vector (col, row) of the image
+
 Network = Callable[[np.ndarray], dict[str, np.ndarray]]  # image (s, s, 3) uint8 -> named maps, batch axis dropped
 
 
@@ -147,15 +149,15 @@ class Flip(NamedTuple):
         return vector
 
     def back(self, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Maps (C, s, s) of the flipped image as maps of the image itself; `offset` (col, row) turns with it."""
+        """Maps (C, s, s) of the flipped image as maps of the image itself; those of `DIRECTED` (col, row) turn with it."""
         out = {}
         for name, value in maps.items():
             value = value[:, :: -1 if self.rows else 1, :: -1 if self.columns else 1]
-            if name == "offset":
+            if name in DIRECTED:
                 value = value * np.array([-1 if self.columns else 1, -1 if self.rows else 1], np.float32)[:, None, None]
             if self.transpose:
                 value = value.transpose(0, 2, 1)
-                value = value[::-1] if name == "offset" else value
+                value = value[::-1] if name in DIRECTED else value
             out[name] = np.ascontiguousarray(value)
         return out
 

@@ -1,69 +1,105 @@
 """Scoring: how likely a section that a dense network shows is right.
 
-In: a network's maps and the labels decoded from them. Out: **evidence**, sums that can be added up where a section is cut by
-seams; **traits**, what tells good sections from bad ones; and from them, by the weights of the contract, a score.
+In: a network's maps, its image and the labels decoded from them. Out: **evidence**, sums that can be added up where a section is
+cut by seams; **traits**, what tells good sections from bad ones; and from them, by the small network of the contract
+(`score`), a score.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-EVIDENCE = ("area", "length", "roof", "rim", "inside", "summit")
+from kibs_steps.models import perceptron, regions
+
+EVIDENCE = ("length", "rim", *regions.COLUMNS)  # rim pixels, the sum of `edge` on them; then what regions say
+TRAITS = (
+    "area",  # log px
+    "roof",  # means: on all pixels, `edge` on the rim and inside
+    "rim",
+    "inside",
+    "summit",  # highest distance − edge
+    "rim length",  # against that of a square of the same area
+    "fill",  # share of the ellipse of inertia
+    "evenness",  # standard deviation of brightness
+    "slope",  # m per px, as the network sees the plane
+    "warp",  # standard deviation of slope
+    "aim off",  # of the middle that pixels see from the section's own, in sides of a square of its area
+    "aim spread",
+)
 
 
 def evidence(
-    labels: np.ndarray, rim: np.ndarray, roof: np.ndarray, edge: np.ndarray, distance: np.ndarray, n: int | None = None
+    labels: np.ndarray,
+    rim: np.ndarray,
+    rgb: np.ndarray,
+    maps: dict[str, np.ndarray],
+    n: int | None = None,
+    origin: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """What the maps say of each section 1…n (n, 6), columns `EVIDENCE`: number of pixels and of `rim` pixels, sums of `roof`, of
-    `edge` on the rim and inside, highest distance − edge. That of a section's parts adds up to its own (`together`)."""
+    """What image and maps say of each section 1…n of labels (s, s): (n, 21), columns EVIDENCE.
+
+    `rim` is bool (s, s): where sections have their rim. The rest is as in `regions.sums`. What is said of a section's parts adds
+    up to its own evidence (`together`).
+    """
     n = int(labels.max(initial=0)) if n is None else n
-    level = distance - edge
-    summit = np.full(n + 1, -np.inf, level.dtype)  # numpy is quick where no value changes its type
-    np.maximum.at(summit, labels.ravel(), level.ravel())
-
-    def total(where: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
-        weights = None if values is None else values[where].astype(np.float64)
-        return np.bincount(labels[where], weights, n + 1)
-
-    on, off = rim & (labels > 0), ~rim & (labels > 0)
-    columns = [total(on | off), total(on), total(on | off, roof), total(on, edge), total(off, edge), summit]
-    return np.column_stack(columns)[1:].astype(np.float64)
+    edge = maps["edge"][0]
+    on = rim & (labels > 0)
+    length, along = np.bincount(labels[on], minlength=n + 1), np.bincount(labels[on], edge[on].astype(float), n + 1)
+    rest = regions.sums(labels, rgb, maps, maps["distance"][0] - edge, n, origin)
+    return np.column_stack([length[1:], along[1:], rest])
 
 
 def none(n: int) -> np.ndarray:
-    """Evidence (n, 6) of sections of which nothing is told."""
+    """Evidence (n, 21) of sections of which nothing is told."""
     return np.zeros((n, len(EVIDENCE)))
 
 
 def together(parts: np.ndarray) -> np.ndarray:
-    """Evidence (6,) of a section from that of its parts (k, 6)."""
-    return np.append(parts[:, :-1].sum(axis=0), parts[:, -1].max())
+    """Evidence (21,) of a section from that of its parts (k, 21)."""
+    return regions.merged(parts, np.zeros(len(parts), int), 1)[0]
 
 
-def traits(found: np.ndarray) -> dict[str, np.ndarray]:
-    """What tells good sections from bad ones, (n,) each, from their `evidence` (n, 6): area (log px), mean roof probability, mean
-    edge on the rim and inside, height of the summit, and the rim's length against that of a square of the same area."""
-    area, length, roof, rim, inside, summit = found.T
-    return {
-        "log_area": np.log(np.maximum(area, 1)),
-        "roof": roof / np.maximum(area, 1),
-        "rim": rim / np.maximum(length, 1),
-        "inside": inside / np.maximum(area - length, 1),
-        "summit": summit,
-        "rim_length": length**2 / (16.0 * np.maximum(area, 1)),
-    }
+def told(found: np.ndarray) -> np.ndarray:
+    """Of which sections (n,) bool anything is told."""
+    return found[:, EVIDENCE.index("area")] > 0
+
+
+def traits(found: np.ndarray) -> np.ndarray:
+    """What tells good sections from bad ones, (n, 12), columns TRAITS, from their `evidence` (n, 21)."""
+    length, along = found[:, 0], found[:, 1]
+    seen = found[:, 2:]
+    area = seen[:, 0]
+    edge = seen[:, regions.COLUMNS.index("edge")]
+    return np.column_stack(
+        [
+            np.log(area),
+            regions.mean(seen, "roof"),
+            along / np.maximum(length, 1),
+            (edge - along) / np.maximum(area - length, 1),
+            seen[:, -1],
+            length**2 / (16.0 * area),
+            regions.fill(seen),
+            np.sqrt(regions.brightness_variance(seen)),
+            np.linalg.norm(regions.mean(seen, regions.SLOPE), axis=1),
+            np.sqrt(regions.slope_variance(seen)),
+            regions.aim_off(seen),
+            np.sqrt(regions.aim_variance(seen) / area),
+        ]
+    )
 
 
 def sure(found: np.ndarray, least: float) -> np.ndarray:
-    """Which sections (n,) bool are roofs by their `evidence` (n, 6): of a mean roof probability of `least`, or nothing told."""
-    return (found[:, 0] == 0) | (traits(found)["roof"] >= least)
+    """Which sections (n,) bool are roofs by their `evidence` (n, 21): of a mean roof probability of `least`, or nothing told."""
+    return ~told(found) | (found[:, EVIDENCE.index("roof")] >= least * found[:, EVIDENCE.index("area")])
 
 
-def scores(found: np.ndarray, score: dict[str, float] | None) -> np.ndarray:
-    """How likely sections are right (n,) float32, from their `evidence` and the contract's weights of `traits`; without weights
-    their mean roof probability."""
-    seen = traits(found)
-    if score is None:
-        return seen["roof"].astype(np.float32)
-    logit = sum((score[name] * value for name, value in seen.items()), start=np.float64(score["bias"]))
-    return (1 / (1 + np.exp(-logit))).astype(np.float32)
+def scores(found: np.ndarray, score: dict[str, Any] | None) -> np.ndarray:
+    """How likely sections are right (n,) float32, from their `evidence` by the contract's `score`; without one their mean roof
+    probability; 0 where nothing is told."""
+    known = told(found)
+    answer = np.zeros(len(found), np.float32)
+    seen = found[known]
+    answer[known] = regions.mean(seen[:, 2:], "roof") if score is None else perceptron.likely(traits(seen), score)
+    return answer

@@ -1,19 +1,13 @@
-"""Weights of a known law come back; a section is right where it meets a true one."""
+"""A section is right where it meets a true one; a score tells which are."""
 
 import numpy as np
+import toy
+from scipy import ndimage
 
 from kibs_steps.learn import calibration
+from kibs_steps.learn.samples import Sample
+from kibs_steps.models import contract as contracts
 from kibs_steps.models import heads
-
-
-def test_weights_of_a_known_law_come_back():
-    rng = np.random.default_rng(0)
-    n = 20000
-    traits = {"log_area": rng.normal(5, 1, n), "rim": rng.uniform(0, 1, n)}
-    logit = 1.5 * traits["log_area"] - 2.0 * traits["rim"] - 6.0
-    hits = rng.random(n) < 1 / (1 + np.exp(-logit))
-    found = calibration.weights([traits], [hits])
-    np.testing.assert_allclose([found["log_area"], found["rim"], found["bias"]], (1.5, -2.0, -6.0), atol=0.2)
 
 
 def test_right_is_iou_by_brute_force():
@@ -30,11 +24,36 @@ def test_right_is_iou_by_brute_force():
     np.testing.assert_array_equal(calibration.right(found, truth), expected)
 
 
-def test_scores_follow_the_weights():
-    """With weight on the area alone, the larger of two sections scores higher, by the logistic function of its logarithm."""
-    roof = np.zeros((32, 32))
-    roof[2:8, 2:8] = roof[12:30, 4:28] = 1
-    weights = dict.fromkeys(("roof", "rim", "inside", "summit", "rim_length"), 0.0) | {"log_area": 1.0, "bias": -5.0}
-    found = heads.dense_sections(roof, 0 * roof, roof, {"roof": 0.5, "prominence": 0.2, "min_area": 4}, weights)
-    area = np.bincount(found.labels.ravel())[1:]
-    np.testing.assert_allclose(found.scores, 1 / (1 + np.exp(5.0) / area), rtol=1e-5)
+def scene(seed: int):
+    """Square roofs, some of them cut into quarters by edges that are none: maps, sample."""
+    rng = np.random.default_rng(seed)
+    labels, edge = np.zeros((96, 96), np.int32), np.zeros((96, 96))
+    for i, (row, col) in enumerate(np.argwhere(np.ones((4, 4))) * 24 + 4, start=1):
+        labels[row : row + 16, col : col + 16] = i
+        if rng.random() < 0.5:
+            edge[row : row + 16, col + 7 : col + 9] = edge[row + 7 : row + 9, col : col + 16] = 0.9
+    roof = (labels > 0).astype(float)
+    distance = np.minimum(ndimage.distance_transform_edt((roof > 0) & (edge == 0)) / 5, 1)
+    sample = Sample.ground(np.zeros((96, 96, 3), np.uint8))._replace(labels=labels, roof=roof.astype(np.uint8))
+    return {"roof": roof[None], "edge": edge[None], "distance": distance[None]}, sample
+
+
+def test_a_score_tells_right_from_wrong():
+    """Quarters are wrong and squares are right: on other scenes the one score low, the other high."""
+    contract = {"head": "dense", "thresholds": {"roof": 0.5, "prominence": 0.2, "min_area": 6}}
+    score = calibration.score([scene(seed) for seed in range(6)], contract, steps=300)
+    contracts.validate(toy.contract("sections", score=score), "fitted")
+    maps, sample = scene(99)
+    found = heads.decode_sections(maps, {**contract, "score": score}, sample.rgb)
+    right = calibration.right(found.labels, sample.labels)
+    assert 0 < right.sum() < len(right)
+    assert found.scores[right].min() > 0.8
+    assert found.scores[~right].max() < 0.2
+    again = calibration.score([scene(seed) for seed in range(6)], contract, steps=300)
+    assert again == score
+
+
+def test_what_is_unknown_says_nothing():
+    maps, sample = scene(0)
+    contract = {"head": "dense", "thresholds": {"roof": 0.5, "prominence": 0.2, "min_area": 6}}
+    assert calibration.score([(maps, sample._replace(labels=np.full_like(sample.labels, -1)))], contract) is None

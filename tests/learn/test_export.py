@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="export needs the extra `learn` (tor
 from kibs_steps.learn import export, sources, training  # noqa: E402
 from kibs_steps.learn.architectures import OUTPUTS  # noqa: E402
 from kibs_steps.models import contract as contracts  # noqa: E402
-from kibs_steps.models import heads, runtime  # noqa: E402
+from kibs_steps.models import heads, joining, runtime, scoring  # noqa: E402
 
 
 @pytest.mark.parametrize(("task", "zoom"), [("sections", 1.0), ("sections", 1.5), ("corners", 1.0), ("both", 1.0)])
@@ -70,14 +70,12 @@ def test_one_run_makes_models_for_two_gsds(tmp_path):
 
 
 def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
-    weights = dict.fromkeys(("log_area", "roof", "rim", "inside", "summit", "rim_length", "bias"), 0.5)
-    join = {
-        "mean": [0.0] * 23,
-        "spread": [1.0] * 23,
-        "least": 0.5,
-        "layers": [{"weights": [[1.0]] * 23, "bias": [0.0]}],
-    }
-    like = export.contract_of("sections", thresholds={"roof": 0.66, "min_area": 20}, score=weights, join=join)
+    score, join = (
+        {"mean": [0.0] * n, "spread": [1.0] * n, "layers": [{"weights": [[1.0]] * n, "bias": [0.0]}]}
+        for n in (len(scoring.TRAITS), len(joining.TRAITS))
+    )
+    join["least"] = 0.5
+    like = export.contract_of("sections", thresholds={"roof": 0.66, "min_area": 20}, score=score, join=join)
     export.export(training.network("sections"), tmp_path / "like.onnx", like)
     state = {"average": training.network("sections").state_dict(), "step": 1, "seconds": 1.0}
     for gsd, min_area in ((0.38, 20), (0.5, 6.9)):
@@ -87,7 +85,7 @@ def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
         export.main([*options, f"--like={tmp_path}/like.onnx"])
         contract = contracts.load(tmp_path / "new.onnx", "sections").contract
         assert contract["thresholds"] == {"roof": 0.66, "prominence": 0.2, "min_area": min_area, "sure": 0.6}
-        assert contract["score"] == weights
+        assert contract["score"] == score
         assert contract["join"] == join
 
 

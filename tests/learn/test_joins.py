@@ -8,7 +8,7 @@ from kibs_steps import photographs
 from kibs_steps.learn import joins
 from kibs_steps.learn.samples import Sample
 from kibs_steps.models import contract as contracts
-from kibs_steps.models import heads, joining
+from kibs_steps.models import heads, joining, perceptron, scoring
 
 THRESHOLDS = {"roof": 0.5, "min_area": 6}
 
@@ -70,8 +70,8 @@ def test_ground_and_unknown_neighbours_teach_nothing():
 def test_small_basins_weigh_less():
     basins = np.zeros((40, 40), int)
     basins[:30, :20], basins[:30, 20:], basins[30:34, :4] = 1, 2, 3
-    flat = np.zeros(basins.shape)
-    graph = joining.graph(basins, np.zeros((40, 40, 3), np.uint8), flat, flat, flat)
+    flat = np.zeros((1, *basins.shape))
+    graph = joining.graph(basins, np.zeros((40, 40, 3), np.uint8), {"roof": flat, "edge": flat}, flat[0])
     shares = np.array([[0, 0, 600.0], [0, 0, 600.0], [0, 0, 16.0]])
     pairs = joins.met([joins.Lesson(graph, shares)], None)
     np.testing.assert_allclose(pairs.weight, [20.0, 4.0])
@@ -110,8 +110,8 @@ def test_a_model_learns_to_join(tmp_path, monkeypatch):
     after = contracts.load(path, "sections")
     lower = {**before.contract, "thresholds": {**before.contract["thresholds"], "prominence": joins.PROMINENCE}}
     assert {k: v for k, v in after.contract.items() if k not in ("join", "score")} == lower
-    assert joining.chained(after.contract["join"]["layers"])
-    assert set(after.contract["score"]) >= {"roof", "bias"}
+    assert perceptron.leads(after.contract["join"], len(joining.TRAITS))
+    assert perceptron.leads(after.contract["score"], len(scoring.TRAITS))
     assert after.sha256 != before.sha256
 
 

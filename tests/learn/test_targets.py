@@ -51,6 +51,19 @@ def test_slope_is_that_of_each_plane():
     assert np.isnan(rise[:, 0, 5]).all()  # the middle of the last cells lies off the roof
 
 
+def test_centre_is_the_way_to_the_middle_of_the_section():
+    labels = np.zeros((16, 200), np.int32)
+    labels[2:14, 2:12], labels[2:14, 16:196] = 1, 2  # middles (7, 8) and (106, 8)
+    labels[:, 196:] = 3  # cut by the tile
+    way = targets.centre(labels)
+    np.testing.assert_allclose(way[:, 1, 1], (1, 2))  # the cell's middle is (6, 6)
+    np.testing.assert_allclose(way[:, 1, 25], (4, 2))  # (102, 6)
+    np.testing.assert_allclose(np.hypot(*way[:, 1, 5]), 64, rtol=1e-6)  # (22, 6): 84 px away
+    np.testing.assert_allclose(way[1, 1, 5] / way[0, 1, 5], 2 / 84, rtol=1e-6)
+    assert np.isnan(way[:, 1, 49]).all()
+    assert np.isnan(way[:, 1, 3]).all()  # (14, 6) lies between the two
+
+
 def test_edge_ignores_unknown_and_keeps_shared_rims(labels):
     edge = targets.edge(labels)
     assert (edge[labels == -1] == targets.IGNORED).all()

@@ -76,10 +76,10 @@ def test_the_best_decoding_keeps_apart_what_is_apart():
     sample = sample._replace(labels=labels, roof=(labels > 0).astype(np.uint8))
     contract = {"head": "dense", "thresholds": {"roof": 0.95, "prominence": 0.9, "min_area": 12}}
     sets = [([shown(labels, 0.6)], [sample]), ([shown(labels, 0.8)], [sample])]
-    thresholds, weights = validation.best_decoding(sets, contract)
+    thresholds, score = validation.best_decoding(sets, contract)
     assert thresholds["roof"] < 0.9
     found = heads.decode_sections(
-        sets[0][0][0], {**contract, "thresholds": {**thresholds, "min_area": 12}, "score": weights}, sample.rgb
+        sets[0][0][0], {**contract, "thresholds": {**thresholds, "min_area": 12}, "score": score}, sample.rgb
     )
     match = validation.matches(found.labels, found.scores, labels)
     assert match.hits.all()

@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from kibs_steps.models import heads
 
+RGB = np.zeros((64, 64, 3), np.uint8)
 THRESHOLDS = {"roof": 0.5, "prominence": 0.2, "min_area": 10, "corner": 0.3, "score": 0.5}
 HEIGHTS = {"edges": [0.0, 1.0, 2.0, 4.0], "centres": [0.5, 1.5, 3.0], "fallback": 2.0}
 
@@ -19,7 +20,7 @@ def ideal_maps(labels, clip=4.0):
         d = ndimage.distance_transform_edt(inside)[1:-1, 1:-1]
         edge[(d > 0) & (d <= 1)] = 1
         distance = np.maximum(distance, np.minimum(d / clip, 1))
-    return (labels > 0).astype(float), edge, distance
+    return {"roof": (labels > 0).astype(float)[None], "edge": edge[None], "distance": distance[None]}
 
 
 def test_adjacent_sections_come_back_apart():
@@ -27,7 +28,7 @@ def test_adjacent_sections_come_back_apart():
     labels[8:30, 10:40] = 1
     labels[30:50, 10:40] = 2
     labels[55:60, 50:60] = 3
-    found = heads.dense_sections(*ideal_maps(labels), THRESHOLDS)
+    found = heads.dense_sections(ideal_maps(labels), THRESHOLDS, RGB)
     assert found.labels.max() == 3
     for label in (1, 2, 3):
         values, counts = np.unique(found.labels[labels == label], return_counts=True)
@@ -39,9 +40,8 @@ def test_adjacent_sections_come_back_apart():
 def test_a_tile_alone_is_without_what_is_not_sure():
     labels = np.zeros((64, 64), int)
     labels[8:20, 10:40], labels[30:50, 10:40], labels[55:60, 50:60] = 1, 2, 3
-    roof, edge, distance = ideal_maps(labels)
-    roof[labels == 2] = 0.55
-    outputs = {"roof": roof[None], "edge": edge[None], "distance": distance[None]}
+    outputs = ideal_maps(labels)
+    outputs["roof"][0][labels == 2] = 0.55
     contract = {"head": "dense", "thresholds": THRESHOLDS}
     every = heads.decode_sections(outputs, contract, np.zeros((64, 64, 3), np.uint8))
     assert heads.alone(every, outputs, contract) is every
@@ -73,7 +73,7 @@ def test_joining_depends_on_the_highest_pass_only():
 def test_thin_roof_without_marker_is_a_section():
     labels = np.zeros((32, 32), int)
     labels[10:12, 4:28] = 1
-    found = heads.dense_sections(*ideal_maps(labels, 8.0), THRESHOLDS)
+    found = heads.dense_sections(ideal_maps(labels, 8.0), THRESHOLDS, RGB[:32, :32])
     np.testing.assert_array_equal(found.labels, labels)
 
 
@@ -89,8 +89,7 @@ def test_specks_are_absorbed_or_dropped():
 
 
 def test_no_roof_no_sections():
-    zero = np.zeros((16, 16))
-    found = heads.dense_sections(zero, zero, zero, THRESHOLDS)
+    found = heads.dense_sections(ideal_maps(np.zeros((16, 16), int)), THRESHOLDS, RGB[:16, :16])
     assert found.labels.max() == 0
     assert len(found.scores) == 0
 

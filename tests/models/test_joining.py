@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kibs_steps.models import contract as contracts
-from kibs_steps.models import heads, joining
+from kibs_steps.models import heads, joining, regions, runtime
 
 SIDE = 20
 
 
 def patches(seed, most=9):
-    """Random rectangular basins 1…n over a part of a tile, with an image and maps: basins, rgb, roof, edge, level."""
+    """Random rectangular basins 1…n over a part of a tile, with an image and maps: basins, rgb, maps, level."""
     rng = np.random.default_rng(seed)
     basins = np.zeros((SIDE, SIDE), int)
     for label in range(1, most):
@@ -23,8 +23,14 @@ def patches(seed, most=9):
         basins[row : row + rng.integers(2, 9), col : col + rng.integers(2, 9)] = label
     basins = heads.relabelled(basins)
     rgb = rng.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
-    roof, edge, level = rng.random((3, SIDE, SIDE)).astype(np.float32)
-    return basins, rgb, roof, edge, level
+    roof, edge, slope, centre = (rng.random((n, SIDE, SIDE)).astype(np.float32) for n in (1, 1, 2, 2))
+    maps = {"roof": roof, "edge": edge, "slope": slope - 0.5, "centre": 8 * centre - 4}
+    return basins, rgb, maps, rng.random((SIDE, SIDE)).astype(np.float32)
+
+
+def flat(side):
+    """Maps of nothing: sides (rows, cols)."""
+    return {name: np.zeros((n, *side)) for name, n in (("roof", 1), ("edge", 1), ("slope", 2), ("centre", 2))}
 
 
 def policy(**weights):
@@ -36,14 +42,18 @@ def policy(**weights):
 
 
 def test_sums_are_what_counting_finds():
-    basins, rgb, roof, edge, level = patches(1)
-    found = joining.graph(basins, rgb, roof, edge, level)
+    basins, rgb, maps, level = patches(1)
+    found = joining.graph(basins, rgb, maps, level)
+    roof, edge, slope, centre = maps["roof"][0], maps["edge"][0], maps["slope"], maps["centre"]
     for label in range(1, basins.max() + 1):
         row, col = np.nonzero(basins == label)
         colour = rgb[row, col] / 255
         bright = colour.mean(1)
         places = (col.sum(), row.sum(), (col * col).sum(), (col * row).sum(), (row * row).sum())
-        values = (*colour.sum(0), (bright**2).sum(), roof[row, col].sum(), edge[row, col].sum(), level[row, col].max())
+        values = [*colour.sum(0), (bright**2).sum(), roof[row, col].sum(), edge[row, col].sum()]
+        tilt = slope[:, row, col].astype(float)
+        aim = np.stack([col, row]) + centre[:, row, col].astype(float)
+        values += [*tilt.sum(1), (tilt**2).sum(), *aim.sum(1), (aim**2).sum(), level[row, col].max()]
         np.testing.assert_allclose(found.basins[label - 1], (len(row), *places, *values), rtol=1e-6)
     rims = {}
     for row, col in itertools.product(range(SIDE), range(SIDE)):
@@ -78,31 +88,57 @@ def test_sums_of_what_has_joined_are_those_of_one_basin(seed, left):
 @given(st.integers(0, 10_000), st.integers(0, 3), st.booleans())
 def test_neither_numbers_nor_directions_count(seed, turns, mirrored):
     """Turned, mirrored and with other labels, a tile falls into the same sections."""
-    basins, *shown = patches(seed)
-    join = policy(rim_edge=-4.0, brightness_apart=-5.0, fill_together=3.0, rim_bend=-0.5, bias=1.0)
-    found = joining.sections(basins, *shown, join)
+    basins, rgb, maps, level = patches(seed)
+    join = policy(
+        rim_edge=-4.0,
+        brightness_apart=-5.0,
+        slope_apart=-2.0,
+        aims_apart=-2.0,
+        aim_off_together=-1.0,
+        fill_together=3.0,
+        rim_bend=-0.5,
+        bias=1.0,
+    )
+    found = joining.sections(basins, rgb, maps, level, join)
 
     def moved(image):
         return np.ascontiguousarray(np.rot90(image[:, ::-1] if mirrored else image, turns))
 
     labels = np.append(0, 1 + np.random.default_rng(seed).permutation(basins.max()))
-    again = joining.sections(moved(labels[basins]), *map(moved, shown), join)
+    turned = {name: np.stack([moved(channel) for channel in values]) for name, values in maps.items()}
+    for name in runtime.DIRECTED[1:]:
+        if mirrored:
+            turned[name][0] *= -1
+        for _ in range(turns):  # counter-clockwise: what led east leads north
+            turned[name] = np.stack([turned[name][1], -turned[name][0]])
+    again = joining.sections(moved(labels[basins]), moved(rgb), turned, moved(level), join)
     np.testing.assert_array_equal(heads.relabelled(moved(found)), heads.relabelled(again))
 
 
 def test_shapes_in_closed_form():
     tile = np.zeros((40, 60), int)
     tile[4:14, 5:45], tile[14:34, 5:45] = 1, 2
-    rgb, flat = np.zeros((40, 60, 3), np.uint8), np.zeros(tile.shape)
+    rgb, maps = np.zeros((40, 60, 3), np.uint8), flat(tile.shape)
     rgb[tile == 1] = 51
-    found = joining.graph(tile, rgb, flat, flat, flat)
-    long, short = joining.spread(found.basins)
+    maps["slope"][0][tile == 1], maps["slope"][1][tile == 2] = 0.3, 0.4
+    maps["slope"][1, 14:34, 5:45:2] += 0.2  # uneven: 0.4 and 0.6, a standard deviation of 0.1
+    maps["centre"] = np.stack([24.5 - np.mgrid[:40, :60][1], 19.5 - np.mgrid[:40, :60][0]])  # all see one middle
+    found = joining.graph(tile, rgb, maps, np.zeros(tile.shape))
+    long, short = regions.spread(found.basins)
     np.testing.assert_allclose(long, 40 / np.sqrt(12))
     np.testing.assert_allclose(short, np.array([10, 20]) / np.sqrt(12))
-    np.testing.assert_allclose(joining.fill(found.basins), 3 / np.pi)
+    np.testing.assert_allclose(regions.fill(found.basins), 3 / np.pi)
     shown = dict(zip(joining.TRAITS, joining.traits(found)[0], strict=True))
     assert shown["brightness apart"] == pytest.approx(0.2)
     assert shown["colour apart"] == pytest.approx(0, abs=1e-9)
+    assert shown["slope apart"] == pytest.approx(np.hypot(0.3, 0.5))
+    assert shown["slope told apart"] == pytest.approx(np.hypot(0.3, 0.5) / np.sqrt(0.01 + 1e-4))
+    assert (shown["slope least"], shown["slope most"]) == pytest.approx((0.3, 0.5))
+    assert shown["aims apart"] == pytest.approx(0, abs=1e-9)
+    # The rows lie from 4 to 13 and from 14 to 33: 8.5, 23.5, and 18.5 for both.
+    assert shown["aim off least"] == pytest.approx(4 / np.sqrt(800))
+    assert shown["aim off most"] == pytest.approx(11 / np.sqrt(400))
+    assert shown["aim off together"] == pytest.approx(1 / np.sqrt(1200))
     assert shown["rim share"] == pytest.approx(np.log(40 / np.sqrt(400)))
     assert shown["rim bend"] == pytest.approx(1 / 40)  # a straight rim is as wide as a pixel
     assert shown["fill together"] == pytest.approx(3 / np.pi)
@@ -111,32 +147,29 @@ def test_shapes_in_closed_form():
 def test_what_is_likely_joins_step_by_step_and_no_more():
     """Four strips in a row; a rim between the second and the third. The policy sees the rim alone."""
     basins = np.repeat([[1, 1, 1, 2, 2, 3, 3, 4, 4, 4]], 6, axis=0)
-    edge = np.zeros(basins.shape)
-    edge[:, 4:6] = 1
+    maps, level = flat(basins.shape), np.zeros(basins.shape)
+    maps["edge"][0, :, 4:6] = 1
     rgb = np.zeros((*basins.shape, 3), np.uint8)
-    found = joining.sections(basins, rgb, edge, edge, edge, policy(rim_edge=-4.0, bias=1.0))
+    found = joining.sections(basins, rgb, maps, level, policy(rim_edge=-4.0, bias=1.0))
     assert len(np.unique(found)) == 2
     assert (found[:, :5] == found[0, 0]).all()
     assert (found[:, 5:] == found[0, 9]).all()
-    none = joining.sections(basins, rgb, edge, edge, edge, policy(bias=-1.0))
+    none = joining.sections(basins, rgb, maps, level, policy(bias=-1.0))
     np.testing.assert_array_equal(none, basins)
-    alone = joining.sections((basins == 1).astype(int), rgb, edge, edge, edge, policy(bias=1.0))
+    alone = joining.sections((basins == 1).astype(int), rgb, maps, level, policy(bias=1.0))
     np.testing.assert_array_equal(alone, basins == 1)
 
 
-def test_a_network_of_two_layers_in_closed_form():
-    n = len(joining.TRAITS)
-    seen = np.zeros((2, n))
-    seen[:, 0] = (3.0, 100.0)  # (3 − 1) / 2 = 1; beyond 5 clipped
-    first = np.zeros((n, 2))
-    first[0] = (1.0, -1.0)
-    join = {"mean": [1.0] * n, "spread": [2.0] * n, "least": 0.5}
-    join["layers"] = [
-        {"weights": first.tolist(), "bias": [0.5, 0.0]},
-        {"weights": [[2.0], [9.0]], "bias": [-1.0]},
-    ]
-    np.testing.assert_allclose(joining.likely(seen, join), 1 / (1 + np.exp([-2.0, -10.0])))
-    assert joining.chained(join["layers"])
+def test_maps_that_show_neither_slope_nor_centre():
+    """They have no slope, and see their middle in their own places."""
+    basins, rgb, maps, level = patches(3)
+    silent = {name: maps[name] for name in ("roof", "edge")}
+    nothing = silent | {name: np.zeros_like(maps[name]) for name in ("slope", "centre")}
+    shown = [joining.traits(joining.graph(basins, rgb, some, level)) for some in (silent, nothing)]
+    np.testing.assert_array_equal(*shown)
+    assert not shown[0][:, [name.startswith("slope") for name in joining.TRAITS]].any()
+    off = [name in ("aim off least", "aim off most") for name in joining.TRAITS]
+    np.testing.assert_allclose(shown[0][:, off], 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("spoil", [lambda layers: layers.reverse(), lambda layers: layers[0]["weights"].pop()])
@@ -146,7 +179,7 @@ def test_layers_that_do_not_fit_are_refused(spoil):
     terms = toy.contract("sections", join={**policy(), "layers": layers})
     contracts.validate(terms, "model")
     spoil(layers)
-    with pytest.raises(contracts.ContractMismatch, match="join: the layers do not lead from 23 traits to one number"):
+    with pytest.raises(contracts.ContractMismatch, match="join: its layers do not lead from 32 traits to one number"):
         contracts.validate(terms, "model")
 
 

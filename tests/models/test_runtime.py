@@ -21,8 +21,9 @@ def test_there_and_back(flip):
     np.testing.assert_array_equal(flip.back(maps)["roof"][0], rgb[..., 0])
 
 
+@pytest.mark.parametrize("name", runtime.DIRECTED)
 @given(st.sampled_from(ALL), st.integers(2, 12), st.integers(2, 12), st.floats(-1, 1), st.floats(-1, 1))
-def test_offsets_and_geometry_turn_with_the_image(flip, col, row, east, south):
+def test_vectors_and_geometry_turn_with_the_image(name, flip, col, row, east, south):
     """A mark and the pixel its displacement leads to: displaced in the flipped image, it is the same pixel."""
     size, step = 15, np.round([2 * east, 2 * south])
     vector = np.zeros((1, 6), np.float32)
@@ -35,7 +36,7 @@ def test_offsets_and_geometry_turn_with_the_image(flip, col, row, east, south):
     assert seen[int(r + turned[0, 1]), int(c + turned[0, 0]), 1] == 1
     offset = np.zeros((2, size, size), np.float32)
     offset[:, r, c] = turned[0, 2:4]
-    np.testing.assert_array_equal(flip.back({"offset": offset})["offset"][:, row, col], step)
+    np.testing.assert_array_equal(flip.back({name: offset})[name][:, row, col], step)
 
 
 def test_flips_leave_a_symmetric_network_alone(tmp_path):
