@@ -310,6 +310,9 @@ class Dense(nn.Module):
             raw["height"], raw["roof_slope"] = self.heights(stride_4, x, raw["surface"], geometry)
         if self.zoom != 1:
             raw = {name: resized(x, 1 / self.zoom) for name, x in raw.items()}
+            # The network tells these in pixels as it sees them: so its weights mean the same at every zoom.
+            if "slope" in raw:
+                raw |= {"slope": raw["slope"] * self.zoom, "centre": raw["centre"] / self.zoom}
         return raw
 
     def full_maps(self, x: torch.Tensor) -> dict[str, torch.Tensor]:

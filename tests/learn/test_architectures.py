@@ -42,8 +42,12 @@ def test_a_zoomed_network_is_the_same_network_on_a_larger_image():
         raw = zoomed.logits(small, geometry)
     assert raw["roof"].shape == (1, 1, 64, 64)
     assert raw["surface"].shape[2:] == (32, 32)
-    for name, side in (("roof", 64), ("edge", 64), ("distance", 64), ("slope", 16), ("centre", 16)):
-        smaller = torch.nn.functional.interpolate(expected[name], size=(side, side), mode="bilinear")
+    for name, side, unit in (
+        *((name, 64, 1.0) for name in ("roof", "edge", "distance")),
+        ("slope", 16, 1.5),  # m per px: pixels of the small image are larger
+        ("centre", 16, 1 / 1.5),  # px
+    ):
+        smaller = unit * torch.nn.functional.interpolate(expected[name], size=(side, side), mode="bilinear")
         assert torch.allclose(raw[name], smaller, atol=1e-5)
 
 
