@@ -164,13 +164,13 @@ def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
     return Joined(number, groups(len(order), link), stands, row)
 
 
-def united(pieces: Parts, scorer: dict[str, Any] | None = None, sure: float = 0.0) -> Parts:
+def united(pieces: Parts, scorer: dict[str, Any] | None = None, thresholds: dict[str, float] | None = None) -> Parts:
     """Sections from pieces in order of number: the union of every group, then one section per connected part.
 
     Scores are those of the pieces' evidence together, by the `scorer` (the contract's `score`); without evidence means
     weighted by area.
-    Every part of a group has the score and the sums of heights of the whole. What is no roof by all its evidence (`sure` is the
-    least mean roof probability) is left out.
+    Every part of a group has the score and the sums of heights of the whole. What is no roof by all its evidence and the
+    contract's `thresholds` (`scoring.roofs`) is left out.
     """
     order = np.argsort(pieces.group, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(pieces.group[order]) != 0]) if len(order) else np.zeros(0, int)
@@ -196,7 +196,7 @@ def united(pieces: Parts, scorer: dict[str, Any] | None = None, sure: float = 0.
     score = np.where(scoring.told(evidence), scoring.scores(evidence, scorer), score)
     none = np.zeros(len(rows), np.int64)
     found = Parts(none, none, shapely.normalize(geometry), score, void, split, owner, evidence, sums)
-    return found.take(scoring.sure(evidence, sure))
+    return found.take(scoring.roofs(evidence, score, thresholds or {}))
 
 
 def of_pieces(labels: np.ndarray, heights: pa.Table) -> np.ndarray:
@@ -322,7 +322,7 @@ def sweep(
     tolerance: float,
     rule: str,
     scorer: dict[str, Any] | None,
-    sure: float,
+    thresholds: dict[str, float] | None,
 ) -> Iterator[tuple[int, pa.Table]]:
     """The sections of each row of blocks (table after `SECTIONS`, by id), row after row."""
     whole = joined(blocks, found, rule)
@@ -351,7 +351,7 @@ def sweep(
 
             split = scan_order.first_come(complete.geometry, complete.group, complete.split)
             complete = complete._replace(split=split)
-        open_ = Parts.joined([open_, united(complete, scorer, sure)])
+        open_ = Parts.joined([open_, united(complete, scorer, thresholds)])
         limit = (row + 1) * side
         leaves = np.ones(len(open_.group), bool)
         if tolerance > 0 and row != rows[-1]:
@@ -383,16 +383,16 @@ def stitch(
     reach: float,
     rule: str = "overlap",
     scorer: dict[str, Any] | None = None,
-    sure: float = 0.0,
+    thresholds: dict[str, float] | None = None,
 ) -> Iterator[tuple[Block, pa.Table, pa.Table]]:
     """Every block, row by row, with its sections and corners (tables after `SECTIONS` and `corners.CORNERS`).
 
     `tolerance` (px) smooths pixel outlines, 0 leaves outlines as they are; `reach` (px) is how far from a section its
     corners may lie; `rule` as in `sections.links_across`: by `touch` the first piece in scan order also gives the split.
-    `scorer` is the model's `score`, `sure` is its least mean roof probability of a section (`models.scoring`).
+    `scorer` is the model's `score`, of its `thresholds` those count that say what is sure (`models.scoring`).
     """
     corners = distinct_corners(pa.concat_tables([CORNERS.empty_table(), *(found.corners(b) for b in blocks)]))
-    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule, scorer, sure):
+    for row, table in sweep(blocks, found, grid, tiling, tolerance, rule, scorer, thresholds):
         of = owner_blocks(table["section_id"].to_numpy(), grid, tiling)[:, 1]
         for block in sorted((b for b in blocks if b.row == row), key=lambda b: b.col):
             mine = table.filter(pa.array(of == block.col))
@@ -465,7 +465,7 @@ def main(argv: list[str] | None = None) -> None:
             args.reach,
             args.seam_rule,
             terms.get("score"),
-            terms["thresholds"].get("sure", 0.0),
+            terms["thresholds"],
         )
         for block, mine, near in stitch(blocks, found, facts.grid, tiling, *settings):
             sections(block.name, cut_by(mine, missing))

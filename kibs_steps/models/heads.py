@@ -44,13 +44,14 @@ def decode_sections(outputs: dict[str, np.ndarray], contract: dict[str, Any], rg
 
 
 def alone(found: Sections, outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> Sections:
-    """Sections of a tile that is looked at alone: without those below `thresholds.sure`, numbered anew.
+    """Sections of a tile that is looked at alone: without those that are not sure (`scoring.sure`), numbered anew.
 
     Where tiles are stitched that is asked of whole sections.
     """
     if contract["head"] != "dense" or "sure" not in contract["thresholds"]:
         return found
-    stays = mean_by_label(outputs["roof"][0], found.labels, len(found.scores)) >= contract["thresholds"]["sure"]
+    roof = mean_by_label(outputs["roof"][0], found.labels, len(found.scores))
+    stays = scoring.sure(roof, found.scores, contract["thresholds"])
     number = np.append(0, np.where(stays, np.cumsum(stays), 0)).astype(np.int32)
     return Sections(number[found.labels], found.scores[stays])
 

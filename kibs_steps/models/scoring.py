@@ -90,9 +90,23 @@ def traits(found: np.ndarray) -> np.ndarray:
     )
 
 
-def sure(found: np.ndarray, least: float) -> np.ndarray:
-    """Which sections (n,) bool are roofs by their `evidence` (n, 21): of a mean roof probability of `least`, or nothing told."""
-    return ~told(found) | (found[:, EVIDENCE.index("roof")] >= least * found[:, EVIDENCE.index("area")])
+def sure(roof: np.ndarray, scores: np.ndarray, thresholds: dict[str, float]) -> np.ndarray:
+    """Which sections (n,) bool are roofs, by their mean roof probability (n,) and their scores (n,).
+
+    It is at least `thresholds.sure`, or `surer` where a section is less `likely` right than that: pieces of yards look like no
+    section that is known, but so do roofs of a kind never seen, of which the roof is sure.
+    """
+    least = thresholds.get("sure", 0.0)
+    unlikely = scores < thresholds.get("likely", 0.0)
+    return roof >= np.where(unlikely, thresholds.get("surer", least), least)
+
+
+def roofs(found: np.ndarray, scores: np.ndarray, thresholds: dict[str, float]) -> np.ndarray:
+    """Which sections (n,) bool are roofs by their `evidence` (n, 21), as `sure` asks; those of which nothing is told are."""
+    known = told(found)
+    stays = ~known
+    stays[known] = sure(regions.mean(found[known, 2:], "roof"), scores[known], thresholds)
+    return stays
 
 
 def scores(found: np.ndarray, score: dict[str, Any] | None) -> np.ndarray:

@@ -51,6 +51,19 @@ def test_a_tile_alone_is_without_what_is_not_sure():
     assert left.scores.shape == (2,)
 
 
+def test_an_unlikely_section_must_be_surer_a_roof():
+    """Of two sections of one roof probability the one of a low score goes; a surer one of a low score stays."""
+    labels = np.zeros((64, 64), int)
+    labels[8:20, 10:40], labels[30:50, 10:40], labels[55:60, 50:60] = 1, 2, 3
+    outputs = ideal_maps(labels)
+    for label, roof in ((1, 0.6), (2, 0.6), (3, 0.8)):
+        outputs["roof"][0][labels == label] = roof
+    found = heads.Sections(labels, np.array([0.5, 0.05, 0.05], np.float32))
+    contract = {"head": "dense", "thresholds": {**THRESHOLDS, "sure": 0.5, "likely": 0.1, "surer": 0.7}}
+    left = heads.alone(found, outputs, contract)
+    np.testing.assert_array_equal(left.labels, np.array([0, 1, 0, 2])[labels])
+
+
 def test_a_summit_counts_by_its_rise_above_the_pass():
     """Two summits of 1 and 0.8 with a pass of 0.5 between them: two sections below a prominence of 0.3, one above it."""
     level = np.full((3, 9), 0.5)
