@@ -197,6 +197,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--commit", help="commit of the training code")
     args = parser.parse_args(argv)
     state = torch.load(args.checkpoint, weights_only=True, map_location="cpu")
+    if "step" not in state:
+        parser.error(f"--checkpoint {args.checkpoint}: weights alone, for training --init; give a run's checkpoint.pt")
     task, settings = args.task, training.Settings(**state["settings"])
     average = state.get("best", {}).get("average") or state["average"]
     gsd = args.gsd or settings.gsd

@@ -67,6 +67,9 @@ def test_one_run_makes_models_for_two_gsds(tmp_path):
     assert (contract["gsd"], contract["tile"], contract["margin"]) == (0.25, 768, 48)
     with pytest.raises(SystemExit):
         export.main([*options, "--task=corners", f"--out={tmp_path}/corners.onnx"])
+    torch.save({"average": average, "settings": settings._asdict()}, tmp_path / "checkpoint.pt")
+    with pytest.raises(SystemExit):  # weights alone, as `--weights` writes them
+        export.main([*options, f"--out={tmp_path}/sections.onnx"])
 
 
 def test_thresholds_and_score_of_the_model_a_run_started_from_hold_on(tmp_path):
