@@ -115,7 +115,8 @@ def test_what_is_sure_is_asked_of_whole_sections():
     pieces = stitch.Parts(none, group, np.array(boxes), np.full(4, 0.5), none > 0, none, none, evidence, heights)
     assert shapely.area(stitch.united(pieces, thresholds={"sure": 0.6}).geometry).tolist() == [160, 100]
     assert len(stitch.united(pieces).geometry) == 3
-    unlikely = {"sure": 0.5, "likely": 0.1, "surer": 0.7}  # by their mean roof probability: told by `scorer` below
+    # What is unlikely right must be surer: nothing is by its mean roof probability, everything by a scorer that doubts all.
+    unlikely = {"sure": 0.5, "likely": 0.1, "surer": 0.7}
     doubtful = {"mean": [0.0] * 12, "spread": [1.0] * 12, "layers": [{"weights": [[0.0]] * 12, "bias": [-5.0]}]}
     assert shapely.area(stitch.united(pieces, thresholds=unlikely).geometry).tolist() == [160, 100, 100]
     assert shapely.area(stitch.united(pieces, doubtful, unlikely).geometry).tolist() == [160, 100]
