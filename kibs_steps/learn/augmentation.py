@@ -5,6 +5,8 @@ In and out: samples. Directions, radiometry and the brightness of roofs vary; ge
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
@@ -67,7 +69,7 @@ def radiometry(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     x = rgb.astype(np.float32) / 255
     rows, cols = rgb.shape[:2]
     if rng.random() < 0.4:  # coarser pixels drawn larger, as pansharpened and resampled imagery is
-        factor = rng.uniform(1.0, 1.7)
+        factor = np.exp(rng.uniform(0.0, 1.0))
         small = cv2.resize(x, (round(cols / factor), round(rows / factor)), interpolation=cv2.INTER_AREA)
         x = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_CUBIC if rng.random() < 0.5 else cv2.INTER_LINEAR)
     if rng.random() < 0.3:
@@ -93,12 +95,22 @@ def radiometry(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         veil = rng.uniform(0.05, 0.35)
         x = (1 - veil) * x + veil * rng.uniform(0.6, 0.9, 3)
     if rng.random() < 0.6:
-        x = x + rng.normal(0, rng.uniform(0.003, 0.035), x.shape)
+        x = x + grain(rng, x.shape, rng.uniform(0.003, 0.035), 1.0 if rng.random() < 0.5 else rng.uniform(1.0, 3.0))
     out = (np.clip(x, 0, 1) * 255).astype(np.uint8)
     if rng.random() < 0.25:
         coded = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 95))])[1]
         out = cv2.imdecode(coded, cv2.IMREAD_COLOR)
     return np.ascontiguousarray(out, dtype=np.uint8)
+
+
+def grain(rng: np.random.Generator, shape: tuple[int, int, int], sigma: float, size: float) -> np.ndarray:
+    """Noise (h, w, 3) of standard deviation `sigma`, in grains of `size` px: a sensor's noise on pixels `size` times as coarse as
+    the image's, drawn larger. Of such blotches a network must not make edges."""
+    if size == 1:
+        return rng.normal(0, sigma, shape)
+    small = rng.normal(0, 1, (math.ceil(shape[0] / size), math.ceil(shape[1] / size), shape[2]))
+    large = cv2.resize(small, shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    return sigma / large.std() * large
 
 
 def repainted(sample: Sample, rng: np.random.Generator) -> Sample:

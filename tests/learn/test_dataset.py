@@ -137,6 +137,16 @@ def test_a_finer_gsd_shows_a_house_larger():
     assert bright[1] / bright[0] == pytest.approx(4, rel=0.1)
 
 
+@pytest.mark.parametrize(("size", "least", "most"), [(1.0, -0.02, 0.02), (2.0, 0.6, 0.8), (3.0, 0.8, 0.95)])
+def test_grain_is_as_coarse_as_asked(size, least, most):
+    """Its standard deviation is the one asked for; neighbours within a grain are alike, those of white noise are not."""
+    noise = augmentation.grain(np.random.default_rng(0), (192, 160, 3), 0.02, size)
+    assert noise.shape == (192, 160, 3)
+    assert noise.std() == pytest.approx(0.02, rel=0.01)
+    for a, b in ((noise[:, :-1], noise[:, 1:]), (noise[:-1], noise[1:])):
+        assert least < np.corrcoef(a.ravel(), b.ravel())[0, 1] < most
+
+
 def test_radiometry_keeps_shape_and_is_the_same_for_a_seed():
     rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     for seed in range(20):
