@@ -48,10 +48,12 @@ def alone(found: Sections, outputs: dict[str, np.ndarray], contract: dict[str, A
 
     Where tiles are stitched that is asked of whole sections.
     """
-    if contract["head"] != "dense" or "sure" not in contract["thresholds"]:
+    if contract["head"] != "dense":
         return found
     roof = mean_by_label(outputs["roof"][0], found.labels, len(found.scores))
     stays = scoring.sure(roof, found.scores, contract["thresholds"])
+    if stays.all():
+        return found
     number = np.append(0, np.where(stays, np.cumsum(stays), 0)).astype(np.int32)
     return Sections(number[found.labels], found.scores[stays])
 
