@@ -95,6 +95,22 @@ def roof_iou(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
     return float(both / max(either, 1))
 
 
+def on_roofs(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Share of found sections (labels 1…n) that are more than half true roof (0, 1, 255 unknown).
+
+    Those that lie mostly on unknown ground are not asked; of the others their known part is.
+    """
+    asked = on = 0
+    for found, truth in pairs:
+        size = np.bincount(found.ravel(), minlength=1)[1:]
+        known = np.bincount(found[truth != UNKNOWN], minlength=len(size) + 1)[1:]
+        roof = np.bincount(found[truth == 1], minlength=len(size) + 1)[1:]
+        judged = (size > 0) & (2 * known >= size)
+        asked += judged.sum()
+        on += (judged & (2 * roof > known)).sum()
+    return float(on / max(asked, 1))
+
+
 def village(folder: str | Path, size: int, gsd: float = dataset.GSD) -> list[Sample]:
     """The real village scenes at `gsd`, mirrored at the border to (size, size); the rim beyond is unknown.
 
@@ -169,13 +185,14 @@ def judge_sections(
     found: Sequence[heads.Sections],
     samples: Sequence[Sample],
 ) -> dict[str, float]:
-    """Roof IoU of all sections together, AP at overlaps 0.5 and 0.75, true and found sections."""
+    """Roof IoU of all sections together, AP at overlaps 0.5 and 0.75, share on roofs, true and found sections."""
     results = [matches(f.labels, f.scores, s.labels) for f, s in zip(found, samples, strict=True)]
     strict = [matches(f.labels, f.scores, s.labels, 0.75) for f, s in zip(found, samples, strict=True)]
     return {
         "roof_iou": roof_iou((f.labels > 0, s.roof) for f, s in zip(found, samples, strict=True)),
         "ap50": average_precision(results),
         "ap75": average_precision(strict),
+        "on_roofs": on_roofs((f.labels, s.roof) for f, s in zip(found, samples, strict=True)),
         "truths": sum(r.truths for r in results),
         "found": sum(len(r.scores) for r in results),
     }

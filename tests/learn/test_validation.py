@@ -48,6 +48,18 @@ def test_roof_iou_leaves_unknown_out():
     assert validation.roof_iou([(found, truth)]) == pytest.approx(1 / 3)
 
 
+def test_sections_on_roofs_are_counted_where_roofs_are_known():
+    found = np.zeros((4, 10), np.int32)
+    found[:, :2], found[:, 2:4], found[:, 4:6], found[:, 6:8] = 1, 2, 3, 4
+    roof = np.zeros((4, 10), np.uint8)
+    roof[:, :2] = 1  # 1: on a roof; 2: beside it
+    roof[:, 4:6] = [1, 255]  # 3: its known half is roof
+    roof[:, 6:8], roof[0, 6] = 255, 0  # 4: hardly known, not asked
+    assert validation.on_roofs([(found, roof)]) == 2 / 3
+    assert validation.on_roofs([(found, roof), (found, np.zeros_like(roof))]) == 2 / 7
+    assert validation.on_roofs([(np.zeros_like(found), roof)]) == 0.0
+
+
 @pytest.mark.skipif("KIBS_DATA" not in os.environ, reason="needs real data: set KIBS_DATA")
 def test_village_scenes_are_judged_only_where_they_are_annotated():
     scenes = validation.village(Path(os.environ["KIBS_DATA"]) / "village", 256)
