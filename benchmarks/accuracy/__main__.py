@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None) -> None:
     told: dict[str, dict[str, Any]] = {}
     samples: dict[float, dict[str, list]] = {}
     for method in found:
-        contract = method.models["sections"].contract
+        contract = method.contract
         settings = scenes.make(args.work / "scenes", args.size, contract["gsd"], city)
         place = args.work / method.name.replace(" ", "_")
         for name, figures in scenes.run(method, settings, place, args.cores).items():

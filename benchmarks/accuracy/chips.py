@@ -20,6 +20,7 @@ from kibs_steps import metrics, photographs
 from kibs_steps.blend import blend
 from kibs_steps.learn import validation
 from kibs_steps.learn.samples import Sample
+from kibs_steps.models import contract as contracts
 from kibs_steps.models import heads, runtime
 
 SIDE = 224  # px: within every model's tile, so that all see the same ground
@@ -81,39 +82,47 @@ class Runner:
 
     def __init__(self, method: Method):
         self.method, self.seconds, self.tiles = method, 0.0, 0
-        self._open: dict[bytes, dict[str, runtime.Network]] = {}
+        self._open: dict[bytes, list[tuple[contracts.Model, runtime.Network]]] = {}
 
-    def networks(self, geometry: np.ndarray) -> dict[str, runtime.Network]:
-        """The two networks (or one, twice) for a geometry (6,)."""
+    def networks(self, geometry: np.ndarray) -> list[tuple[contracts.Model, runtime.Network]]:
+        """The models for sections and corners (one, twice, if it does both) that a geometry (6,) gets, and their networks."""
         key = geometry.tobytes()
         if key not in self._open:
-            models = self.method.models
-            first = runtime.open_network(models["sections"], geometry[None], threads=1)
-            one = models["sections"] is models["corners"]
-            second = first if one else runtime.open_network(models["corners"], geometry[None], threads=1)
-            self._open = {key: {"sections": first, "corners": second}}
+            models = self.method.models(seen_from(geometry, self.method.contract["gsd"]))
+            networks = {m.sha256: runtime.open_network(m, geometry[None], threads=1) for m in models}
+            self._open = {key: [(model, networks[model.sha256]) for model in models]}
         return self._open[key]
 
     def __call__(self, sample: Sample) -> Found:
         """Sections and corners of one sample, its rim mirrored up to the model's tile."""
-        models = self.method.models
-        tile = models["sections"].contract["tile"]
+        (first, find_sections), (second, find_corners) = self.networks(sample.geometry)
+        tile = first.contract["tile"]
         before = (tile - SIDE) // 2
         rest = tile - SIDE - before
         rgb = np.pad(sample.rgb, ((before, rest), (before, rest), (0, 0)), mode="symmetric")
-        networks = self.networks(sample.geometry)
         start = time.process_time()  # of one thread: what else runs on the machine does not count
-        sections = outputs = networks["sections"](rgb)
-        found = heads.decode_sections(sections, models["sections"].contract, rgb)
-        if models["sections"] is not models["corners"]:
-            outputs = networks["corners"](blend(rgb, found.labels, **models["corners"].contract["blend"]))
-        corners = heads.decode_corners(outputs, models["corners"].contract)
+        sections = outputs = find_sections(rgb)
+        found = heads.decode_sections(sections, first.contract, rgb)
+        if second is not first:
+            outputs = find_corners(blend(rgb, found.labels, **second.contract["blend"]))
+        corners = heads.decode_corners(outputs, second.contract)
         self.seconds += time.process_time() - start
         self.tiles += 1
         place = np.column_stack([corners.col, corners.row]) - before
-        judged = heads.alone(found, sections, models["sections"].contract)
+        judged = heads.alone(found, sections, first.contract)
         labels = judged.labels[before : before + SIDE, before : before + SIDE]
         return Found(labels, judged.scores, place[((place >= 0) & (place < SIDE)).all(axis=1)])
+
+
+def seen_from(geometry: np.ndarray, gsd: float) -> dict[str, float] | None:
+    """Azimuth and elevation (deg) of the view that a geometry vector (6,) tells, at `gsd` (m/px); None where it tells none."""
+    if not geometry[4]:
+        return None
+    col, row = geometry[:2].astype(float) * gsd
+    return {
+        "azimuth": float(np.degrees(np.arctan2(-col, row)) % 360),
+        "elevation": float(np.degrees(np.arctan2(1.0, np.hypot(col, row)))),
+    }
 
 
 def figures(samples: Sequence[Sample], found: Sequence[Found]) -> dict[str, Any]:

@@ -13,7 +13,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from benchmarks.accuracy import __main__ as program
 from benchmarks.accuracy import chips, methods, scenes, table
 from kibs_steps.learn.samples import UNKNOWN, Sample
-from kibs_steps.models import contract
+from kibs_steps.models import contract, runtime
+from kibs_steps.view import lean
 
 S = chips.SIDE
 
@@ -78,6 +79,30 @@ def test_methods_of_a_folder(tmp_path):
     (tmp_path / "bad" / "both.onnx").write_bytes(b"x")
     with pytest.raises(contract.NotAModel):
         methods.of(tmp_path / "bad")
+
+
+def test_a_method_takes_the_set_made_for_a_view_as_the_workflow_does(tmp_path):
+    for place, gsd, elevation in (("", 0.38, [45, 90]), ("nadir", 0.38, [85, 90]), ("fine", 0.2, [45, 90])):
+        told = {"data": ["toy"], "licence": "CC0-1.0", "view_elevation": elevation}
+        for task, make in (("sections", toy.sections_model), ("corners", toy.corners_model)):
+            make(tmp_path / place / f"{task}.onnx", toy.contract(task, gsd=gsd, trained_on=told))
+    method = methods.of(tmp_path)[0]
+    assert len(method.sets) == 2  # the finer one is another method
+
+    def place(view):
+        return method.models(view)[0].path.parent
+
+    assert place({"azimuth": 180.0, "elevation": 60.0}) == tmp_path
+    assert place({"azimuth": 0.0, "elevation": 90.0}) == place(None) == tmp_path / "nadir"
+
+
+@pytest.mark.parametrize("view", [(181.1, 59.3), (250.0, 62.0), (30.0, 88.0), (0.0, 90.0)])
+def test_views_are_told_by_geometry_vectors(view):
+    vector = runtime.geometry_vector(lean(*view), None, 0.38)[0]
+    told = chips.seen_from(vector, 0.38)
+    assert told["elevation"] == pytest.approx(view[1])
+    assert view[1] == 90 or told["azimuth"] == pytest.approx(view[0], rel=1e-5)
+    assert chips.seen_from(np.zeros(6, np.float32), 0.38) is None
 
 
 def test_a_runner_sees_the_tile_where_it_is(tmp_path):
