@@ -220,6 +220,13 @@ def main(argv: list[str] | None = None) -> None:
         "--like", help="model whose weights the run started from: its thresholds, score, joins and licence hold on"
     )
     parser.add_argument("--metrics", help="report of learn.validation, kept in the contract")
+    parser.add_argument(
+        "--view-elevation",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="views the model is offered for (deg), if fewer than it was trained on: as one of a suite",
+    )
     parser.add_argument("--commit", help="commit of the training code")
     args = parser.parse_args(argv)
     state = torch.load(args.checkpoint, weights_only=True, map_location="cpu")
@@ -242,6 +249,8 @@ def main(argv: list[str] | None = None) -> None:
         kept = {k: v for k, v in like["thresholds"].items() if k not in BY_SIZE or like["gsd"] == gsd}
         facts["thresholds"] = {**kept, **args.thresholds}
         facts |= {key: like[key] for key in ("score", "join") if key in like}
+    if args.view_elevation:
+        facts["about"] = {**facts["about"], "view_elevation": args.view_elevation}
     if args.commit:
         facts["commit"] = args.commit
     if args.metrics:

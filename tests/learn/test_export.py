@@ -64,6 +64,9 @@ def test_one_run_makes_models_for_two_gsds(tmp_path):
     options = [f"--checkpoint={tmp_path}/checkpoint.pt", "--task=sections", "--gsd=0.25"]
     export.main([*options, f"--out={tmp_path}/sections.onnx"])
     contract = contracts.load(tmp_path / "sections.onnx", "sections").contract
+    assert contract["trained_on"]["view_elevation"] == [45, 90]
+    export.main([*options, "--view-elevation", "85", "90", f"--out={tmp_path}/nadir.onnx"])
+    assert contracts.load(tmp_path / "nadir.onnx", "sections").contract["trained_on"]["view_elevation"] == [85, 90]
     assert (contract["gsd"], contract["tile"], contract["margin"]) == (0.25, 768, 48)
     with pytest.raises(SystemExit):
         export.main([*options, "--task=corners", f"--out={tmp_path}/corners.onnx"])
