@@ -63,8 +63,11 @@ class Method(NamedTuple):
 
 
 def of(folder: Path) -> list[Method]:
-    """The methods of a folder of model sets (or of one set), by name. Raises `NoModels`."""
-    found = []
+    """The methods of a folder of model sets (or of one set), by name; a set that belongs to one is none of its own.
+
+    Raises `NoModels`.
+    """
+    found: list[Method] = []
     for place in [folder, *sorted(p for p in folder.iterdir() if p.is_dir())] if folder.is_dir() else []:
         if (place / "both.onnx").is_file():
             settings = {"models": str(place.resolve()), "method": "single"}
@@ -74,6 +77,8 @@ def of(folder: Path) -> list[Method]:
             papers = sets[0]["sections"].contract["head"] == "instances"
             settings = {"models": str(place.resolve()), "method": "two_stage", "mode": "paper" if papers else "default"}
             found.append(Method(f"{place.name} {'paper pair' if papers else 'two-stage'}", settings, sets))
+    belong = {next(iter(one.values())).path for method in found for one in method.sets[1:]}
+    found = [method for method in found if next(iter(method.sets[0].values())).path not in belong]
     if not found:
         raise NoModels(
             f"{folder} holds no model set: both.onnx, or sections.onnx and corners.onnx, in it or a subfolder"
