@@ -49,7 +49,8 @@ def choose(found: list[Set], gsd: float | None, view: dict[str, float] | None, s
     """The set for a scene of `gsd` (m/px; None unknown) seen and lit from `view` and `sun` (azimuth, elevation deg, or None).
 
     The set whose models were trained nearest to the scene's angles, all that cover them being equally near; then the nearest
-    GSD that is not finer than the raster (else the coarsest); then the set of the narrowest range of views; then by path.
+    GSD that is not finer than the raster (else the coarsest); then the set of the narrowest range of views, the widest where the
+    view is unknown; then by path.
     """
 
     def rank(one: Set) -> tuple:
@@ -57,7 +58,8 @@ def choose(found: list[Set], gsd: float | None, view: dict[str, float] | None, s
         own = next(iter(one.values())).contract["gsd"]
         finer = gsd is not None and own < gsd * (1 - SAME_GSD)
         width = min(_view_range(model.contract["trained_on"]) for model in one.values())
-        return round(off, 6), finer, -own if finer else own, width, str(next(iter(one.values())).path)
+        special = width if view is not None else -width
+        return round(off, 6), finer, -own if finer else own, special, str(next(iter(one.values())).path)
 
     return min(found, key=rank)
 

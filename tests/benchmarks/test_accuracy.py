@@ -92,8 +92,8 @@ def test_a_method_takes_the_set_made_for_a_view_as_the_workflow_does(tmp_path):
     def place(view):
         return method.models(view)[0].path.parent
 
-    assert place({"azimuth": 180.0, "elevation": 60.0}) == tmp_path
-    assert place({"azimuth": 0.0, "elevation": 90.0}) == place(None) == tmp_path / "nadir"
+    assert place({"azimuth": 180.0, "elevation": 60.0}) == place(None) == tmp_path
+    assert place({"azimuth": 0.0, "elevation": 90.0}) == tmp_path / "nadir"
 
 
 @pytest.mark.parametrize("view", [(181.1, 59.3), (250.0, 62.0), (30.0, 88.0), (0.0, 90.0)])

@@ -7,6 +7,7 @@ import toy
 
 from kibs_steps.models import contract, suite
 
+SHIPPED = Path(__file__).parents[2] / "models"
 PAIR = ("sections", "corners")
 
 
@@ -37,16 +38,26 @@ def test_the_nearest_gsd_not_finer_than_the_raster(tmp_path, gsd, expected):
     assert chosen(tmp_path, gsd).stem == f"sections-{expected}"
 
 
+@pytest.mark.parametrize("name", ["free", "research"])
 @pytest.mark.parametrize(("gsd", "expected"), [(0.1, 0.25), (0.25, 0.25), (0.3, 0.38), (0.38, 0.38), (0.5, 0.38)])
-def test_the_shipped_models_are_for_two_gsds(gsd, expected):
-    shipped = suite.sets(Path(__file__).parents[2] / "models" / "research", PAIR)
-    one = suite.choose(shipped, gsd, None, None)
-    assert {model.contract["gsd"] for model in one.values()} == {expected}
+def test_the_shipped_models_are_for_two_gsds(name, gsd, expected):
+    shipped = suite.sets(SHIPPED / name, PAIR)
+    for view in (None, {"azimuth": 181.1, "elevation": 59.3}, {"azimuth": 0.0, "elevation": 90.0}):
+        one = suite.choose(shipped, gsd, view, None)
+        assert {model.contract["gsd"] for model in one.values()} == {expected}
+
+
+@pytest.mark.parametrize(
+    ("elevation", "nadir"), [(59.3, False), (80.0, False), (86.0, True), (90.0, True), (None, False)]
+)
+def test_views_from_above_get_the_set_that_sees_more_finely(elevation, nadir):
+    view = None if elevation is None else {"azimuth": 30.0, "elevation": elevation}
+    one = suite.choose(suite.sets(SHIPPED / "research", PAIR), 0.38, view, None)
+    assert (one["sections"].path.parent.name == "nadir") is nadir
 
 
 def test_the_shipped_sets_say_what_may_be_done_with_them():
-    root = Path(__file__).parents[2] / "models"
-    files = sorted(root.rglob("*.onnx"))
+    root, files = SHIPPED, sorted(SHIPPED.rglob("*.onnx"))
     licences = {path: contract.load(path).contract["trained_on"]["licence"] for path in files}
     assert {path.relative_to(root).parts[0] for path in files} == {"free", "research"}
     for path, licence in licences.items():
@@ -77,6 +88,7 @@ def test_the_more_special_of_two_that_cover(tmp_path):
     add(tmp_path, "-one", view_elevation=[55, 63], view_azimuth=[171, 191])
     assert chosen(tmp_path, 0.38, (181.1, 59.3)).stem == "sections-one"
     assert chosen(tmp_path, 0.38, (90, 59.3)).stem == "sections-all"
+    assert chosen(tmp_path, 0.38).stem == "sections-all"  # seen from nobody knows where
 
 
 def test_a_single_set_and_none(tmp_path):
