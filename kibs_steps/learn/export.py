@@ -19,10 +19,10 @@ from kibs_steps import cli, store
 from kibs_steps.learn import dataset, examples, losses, maskrcnn, sources, training
 from kibs_steps.learn.architectures import OUTPUTS
 from kibs_steps.learn.samples import Sample
+from kibs_steps.models import contract as contracts
 
 if TYPE_CHECKING:
     import onnx
-from kibs_steps.models import contract as contracts
 
 TILE, MARGIN = 512, 32  # px at dataset.GSD
 THRESHOLDS = {
