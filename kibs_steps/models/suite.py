@@ -58,7 +58,7 @@ def choose(found: list[Set], gsd: float | None, view: dict[str, float] | None, s
         own = next(iter(one.values())).contract["gsd"]
         finer = gsd is not None and own < gsd * (1 - SAME_GSD)
         width = min(_view_range(model.contract["trained_on"]) for model in one.values())
-        special = width if view is not None else -width
+        special = width if view is not None else -width  # an unknown view may be any
         return round(off, 6), finer, -own if finer else own, special, str(next(iter(one.values())).path)
 
     return min(found, key=rank)
