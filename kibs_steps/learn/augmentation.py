@@ -16,6 +16,9 @@ from kibs_steps.models import runtime
 AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their source
 FORGOTTEN = 0.15  # share of training tiles whose view a network is not told; and whose sun
 REPAINTED = 0.3  # share of training tiles whose roofs get another brightness
+PAVED = 0.25  # share of training tiles whose yards are laid with light stone
+GROUND, SHADED_GROUND = 0, 4  # kinds of surface (docs/architecture.md, "Training samples")
+YARD = 22.0  # px, about the side of a yard
 
 
 def dihedral(sample: Sample, k: int) -> Sample:
@@ -129,4 +132,30 @@ def repainted(sample: Sample, rng: np.random.Generator) -> Sample:
     share = cv2.GaussianBlur(greyed[buildings].astype(np.float32), (0, 0), rim)[..., None]
     rgb = sample.rgb.astype(np.float32)
     rgb = gain * (rgb + share * (rgb.mean(axis=2, keepdims=True) - rgb))
+    return sample._replace(rgb=np.clip(np.rint(rgb), 0, 255).astype(np.uint8))
+
+
+def paved(sample: Sample, rng: np.random.Generator) -> Sample:
+    """The same roofs among yards of light, grey stone, yard by yard, as behind rows of houses; its texture and shadows stay.
+
+    Bright yards beside dark roofs have straight rims and pass for roofs. Only what is known to be ground is paved.
+    """
+    roofs = sample.labels > 0
+    ground = np.isin(sample.surface, (GROUND, SHADED_GROUND)) & (sample.labels == 0)
+    lit = sample.surface[ground] == GROUND
+    if not roofs.any() or not lit.any():
+        return sample
+    rows, cols = roofs.shape
+    seeds = np.ones((rows, cols), np.uint8)
+    seeds[tuple(rng.integers(0, (rows, cols), (int(rows * cols / YARD**2) + 1, 2)).T)] = 0
+    _, yards = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L1, 3, labelType=cv2.DIST_LABEL_CCOMP)
+    count = int(yards.max()) + 1
+    near = cv2.distanceTransform((~roofs).astype(np.uint8), cv2.DIST_L2, 3) < rng.uniform(10, 40)
+    share = np.where(rng.random(count) < rng.uniform(0.3, 0.9), rng.uniform(0.6, 1.0, count), 0.0)
+    share = cv2.GaussianBlur((share[yards] * (ground & near)).astype(np.float32), (0, 0), rng.uniform(0.5, 1.2))
+    rgb = sample.rgb.astype(np.float32)
+    grey = rgb.mean(axis=2)
+    bright = rng.uniform(90, 200) * np.exp(rng.normal(0, 0.2, (count, 1)) + rng.normal(0, 0.03, (count, 3)))
+    stone = (grey / max(float(grey[ground][lit].mean()), 1.0))[..., None] * bright[yards].astype(np.float32)
+    rgb += share[..., None] * (stone - rgb)
     return sample._replace(rgb=np.clip(np.rint(rgb), 0, 255).astype(np.uint8))

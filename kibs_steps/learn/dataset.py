@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from kibs_steps.simulate.draped import House
 
 GSD = 0.38  # m per px of the models trained here, if no other is asked for
+VIEWS = (45.0, 90.0)  # view elevations (deg) that tiles are seen from, if no others are asked for
 LOOSE = 3  # px, width of the strip about a mask's outline of which nothing is asked
 NADIR = np.array([0, 0, 0, 0, 1, 0], np.float32)
 
@@ -32,7 +33,7 @@ def simulated(
     rng: np.random.Generator,
     size: int = 320,
     backgrounds: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
-    view_elevation: tuple[float, float] = (45.0, 90.0),
+    view_elevation: tuple[float, float] = VIEWS,
     view: tuple[float, float] | None = None,
     sun: tuple[float, float] | None = None,
     cities: Sequence[CityModel] = (),
@@ -227,7 +228,7 @@ class Mixture:
     `shares` are the probabilities of (simulated, pasted houses, chips, own). Simulated tiles come from `pool`, a folder of
     kept samples that another process may still be filling; while it is empty, the other sources stand in. `own` are files of
     kept samples (`learn.own`), as those at `gsd`. The share `forget` comes without view, and without sun. Tiles come `upright`,
-    or turned at random; some have their roofs repainted, some their radiometry changed.
+    or turned at random; some have their roofs repainted, some their yards paved, some their radiometry changed.
     """
 
     def __init__(
@@ -274,6 +275,8 @@ class Mixture:
                 sample = pasted_houses(sample, self.graphs, rng, gsd=self.gsd)
         if rng.random() < augmentation.REPAINTED:
             sample = augmentation.repainted(sample, rng)
+        if rng.random() < augmentation.PAVED:
+            sample = augmentation.paved(sample, rng)
         sample = augmentation.without_geometry(sample, rng, self.forget)
         sample = (
             augmentation.upright(sample, rng) if self.upright else augmentation.dihedral(sample, int(rng.integers(8)))

@@ -132,9 +132,15 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
         ground = dataset.without_truth(dataset.chip_sample(chip, rng, contract["tile"], contract["gsd"]))
         return dataset.pasted_houses(ground, stock.graphs, rng, gsd=contract["gsd"])
     view, sun = (_direction(contract["trained_on"], name) for name in ("view", "sun"))
-    tall = number % sources.TALL_EVERY == sources.TALL_EVERY - 1
     sample = dataset.simulated(
-        rng, contract["tile"], view=view, sun=sun, cities=stock.cities, gsd=contract["gsd"], tall=tall
+        rng,
+        contract["tile"],
+        view_elevation=tuple(contract["trained_on"].get("view_elevation", dataset.VIEWS)),
+        view=view,
+        sun=sun,
+        cities=stock.cities,
+        gsd=contract["gsd"],
+        tall=number % sources.TALL_EVERY == sources.TALL_EVERY - 1,
     )
     if rng.random() < VARIED:
         sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))

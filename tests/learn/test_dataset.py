@@ -177,6 +177,33 @@ def test_repainted_roofs_keep_their_shading_and_the_ground_its_look():
     assert darkest < 50
 
 
+def test_yards_are_paved_and_nothing_else_is(monkeypatch):
+    monkeypatch.setattr(augmentation, "YARD", 200.0)  # one yard
+    rgb = np.full((64, 64, 3), 60, np.uint8)
+    labels, surface = np.zeros((2, 64, 64), np.int32)
+    labels[20:40, 10:24] = surface[20:40, 10:24] = 1
+    surface[40:44, 10:24] = 2  # a wall
+    surface[:, 50:] = UNKNOWN
+    surface[20:40, 24:30], rgb[20:40, 24:30] = 4, 20  # the house's shadow
+    sample = Sample.ground(rgb)._replace(
+        labels=labels, roof=(labels != 0).astype(np.uint8), surface=surface.astype(np.uint8)
+    )
+    ground = np.isin(surface, (0, 4)) & (labels == 0)
+    other = cv2.dilate(ground.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0  # but for rims, mixed as pixels are
+    brighter = []
+    for seed in range(20):
+        paved = augmentation.paved(sample, np.random.default_rng(seed))
+        np.testing.assert_array_equal(paved.rgb[other], rgb[other])
+        np.testing.assert_array_equal(paved.labels, labels)
+        beside, shaded = paved.rgb[30, 33].astype(float), paved.rgb[30, 27].astype(float)
+        assert beside.mean() > 1.5 * shaded.mean()  # shadows stay
+        brighter.append(beside.mean())
+    assert max(brighter) > 120
+    assert min(brighter) <= 60
+    bare = Sample.ground(rgb)
+    np.testing.assert_array_equal(augmentation.paved(bare, np.random.default_rng(0)).rgb, rgb)
+
+
 def test_kept_samples_come_back(marked, tmp_path):
     marked.save(tmp_path / "a.npz")
     back = Sample.load(tmp_path / "a.npz")

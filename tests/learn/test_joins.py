@@ -140,3 +140,11 @@ def test_scenes_are_seen_as_the_model_is_told():
     np.testing.assert_allclose(elevation, 63, atol=9)  # the GSD varies a little too
     # Roofs seen from the north lean to the south, which is down.
     assert (known[:, 1] > 2 * np.abs(known[:, 0])).all()
+
+
+def test_a_model_for_views_from_above_is_shown_no_others():
+    terms = toy.contract("sections", tile=64)
+    terms["trained_on"] |= {"view_azimuth": [0.0, 360.0], "view_elevation": [85.0, 90.0]}
+    leans = np.array([joins.scene(terms, number).geometry[:2] for number in range(6)])
+    assert leans.any()
+    assert np.hypot(*leans.T).max() * toy.GSD < 1.2 * np.tan(np.radians(5))  # the GSD varies a little too
