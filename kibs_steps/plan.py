@@ -256,9 +256,10 @@ def supposes(settings: dict[str, Any], models: dict[str, contract.Model]) -> boo
 
 
 def folder_of(models: str, base: Path) -> Path:
-    """The folder of a model set: a name under `models/`, or a path."""
-    named = base / "models" / models
-    return named if named.is_dir() else Path(models)
+    """The folder of a model set: a name under the workflow's `models/` or under that where it runs (what was trained there), or
+    a path."""
+    named = (base / "models" / models, Path("models") / models)
+    return next((folder for folder in named if folder.is_dir()), Path(models))
 
 
 def grid_size(raster: str, gsd: float, aoi: str | None) -> tuple[int, int]:

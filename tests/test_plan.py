@@ -178,3 +178,13 @@ def test_a_simulated_city_reruns_with_its_file(files):
 def test_other_hardware_reruns_the_models_and_nothing_before(files, settings):
     """Sums in another order differ in their last bits: blocks of both are never mixed."""
     assert changed(files, **settings) == {"sections", "blend", "corners", "single", *AFTER_DETECTION}
+
+
+def test_a_set_is_found_by_name_where_the_workflow_lies_and_where_it_runs(tmp_path, monkeypatch):
+    base, here = tmp_path / "kibs", tmp_path / "here"
+    for folder in (base / "models/research", here / "models/mine"):
+        folder.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    assert plan.folder_of("research", base) == base / "models/research"
+    assert plan.folder_of("mine", base).resolve() == here / "models/mine"
+    assert plan.folder_of("elsewhere/set", base) == Path("elsewhere/set")

@@ -1,7 +1,8 @@
 """Recipe: what `snakemake train` does, from the config key `train` to the options of its programs; needs no torch.
 
 `own` names scenes of the same configuration that have a raster, terrain and truth, or gives such data itself (keys as of a
-scene, and `buildings`, `annotated`); `scene` names the scene a model is fine-tuned for: tiles are simulated at its angles.
+scene, and `buildings`, `annotated`); `scene` names the scene a model is fine-tuned for: tiles are simulated at its angles (also
+those that `metadata` tell).
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps.plan import BadConfig
+from kibs_steps.plan import BadConfig, angles_of, folder_of
 
 DEFAULTS = {
     "name": "mine",
@@ -63,19 +64,26 @@ class Recipe(NamedTuple):
 def recipe(config: dict[str, Any], base: Path) -> Recipe:
     """The recipe of a checked configuration; `base` is the workflow's folder. Raises `BadConfig`."""
     train = {**DEFAULTS, **(config.get("train") or {})}
-    common = {k: v for k, v in config.items() if k in OWN}
+    common = {k: v for k, v in config.items() if k in (*OWN, "metadata")}
     scenes = config.get("scenes") or {}
 
     def settings_of(name: str, wanted_by: str) -> dict[str, Any]:
         if name not in scenes and name != config.get("scene"):
             raise BadConfig(f"train.{wanted_by}: there is no scene {name!r} in the configuration")
-        return {**common, **(scenes.get(name) or {})}
+        return seen({**common, **(scenes.get(name) or {})})
+
+    def seen(settings: dict[str, Any]) -> dict[str, Any]:
+        return {**angles_of(settings), **settings}
 
     own: dict[str, dict[str, Any]] = {}
     for i, item in enumerate(train["own"]):
-        given = settings_of(item, "own") if isinstance(item, str) else {**common, **item}
+        given = settings_of(item, "own") if isinstance(item, str) else seen({**common, **item})
         name = item if isinstance(item, str) else str(item.get("name", f"own{i}"))
         chosen = {k: given[k] for k in OWN if given.get(k) is not None}
+        if given.get("regions"):
+            raise BadConfig(
+                f"train.own: {name} has regions: one view is learned from. Give each region its own aoi and angles"
+            )
         for key in ("raster", "dtm"):
             if key not in chosen:
                 raise BadConfig(f"train.own: {name} has no {key}")
@@ -125,15 +133,9 @@ def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None 
     return options + ([f"--gsd={gsd}"] if gsd else [])
 
 
-def set_folder(init: str, base: Path) -> Path:
-    """The folder of a model set: of that name in `models/`, or a path."""
-    folder = base / "models" / init
-    return folder if folder.is_dir() else Path(init)
-
-
 def like_model(init: str, task: str, base: Path) -> Path | None:
     """The model beside the weights that a training starts from, whose thresholds and licence hold on; None if there is none."""
-    folder = Path(init).parent if Path(init).is_file() else set_folder(init, base)
+    folder = Path(init).parent if Path(init).is_file() else folder_of(init, base)
     path = folder / f"{task}.onnx"
     return path if path.is_file() else None
 
@@ -142,7 +144,7 @@ def weights(init: str, network: str, base: Path) -> Path:
     """The weights to start from: a file, or of a model set its `NETWORK.pt`, `weights.pt` or only `.pt` file."""
     if Path(init).is_file():
         return Path(init)
-    folder = set_folder(init, base)
+    folder = folder_of(init, base)
     named = [folder / f"{network}.pt", folder / "weights.pt"]
     found = [f for f in named if f.is_file()] or sorted(folder.glob("*.pt"))
     if not found or (len(found) > 1 and found[0] not in named):

@@ -95,9 +95,14 @@ def network(task: str = "both", family: str = "dense", zoom: float = 1.0) -> nn.
     return maskrcnn.network(task) if family == "maskrcnn" else Dense(len(CENTRES), task, zoom)
 
 
-def usual_zoom(task: str, gsd: float) -> float:
-    """The zoom unless another is asked for: a network for sections alone sees the ground at about SECTIONS_SEEN m per px."""
-    return max(1.0, round(2 * gsd / SECTIONS_SEEN) / 2) if task == "sections" else 1.0
+def usual_zoom(task: str, gsd: float, init: str | Path | None = None) -> float:
+    """The zoom unless another is asked for: a network for sections alone sees the ground as that whose weights it starts from,
+    else at about SECTIONS_SEEN m per px."""
+    if task != "sections":
+        return 1.0
+    before = torch.load(init, weights_only=True, map_location="cpu").get("settings") if init else None
+    seen = before["gsd"] / before["zoom"] if before and before["task"] == task else SECTIONS_SEEN
+    return max(1.0, round(2 * gsd / seen) / 2)
 
 
 def moved(batch: Any, device: torch.device) -> Any:
@@ -290,7 +295,7 @@ def main(argv: list[str] | None = None) -> None:
         )
     else:
         task = args.task or "both"
-        rate, zoom = args.rate or 2e-3, args.zoom or usual_zoom(task, args.gsd)
+        rate, zoom = args.rate or 2e-3, args.zoom or usual_zoom(task, args.gsd, args.init)
         if zoom <= 0 or zoom % 0.5:
             parser.error(f"--zoom {zoom:g}: it goes by halves (1, 1.5, 2), so that tiles have whole cells of stride 32")
         if zoom != 1 and task != "sections":

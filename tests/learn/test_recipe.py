@@ -1,5 +1,7 @@
 """From `train` in the configuration to the options of the programs."""
 
+import json
+
 import pytest
 
 from kibs_steps.learn import recipe
@@ -87,9 +89,28 @@ def test_fine_tuning_takes_the_scenes_angles_and_the_sets_weights(tmp_path):
     assert recipe.weights(str(folder / "weights.pt"), "both", tmp_path) == folder / "weights.pt"
 
 
+def test_angles_may_come_from_metadata(tmp_path):
+    item = tmp_path / "item.json"
+    item.write_text(json.dumps({"type": "Feature", "properties": {"view:azimuth": 20.0, "view:incidence_angle": 20.0}}))
+    told = {"raster": "t.tif", "dtm": 100, "truth": "t.gpkg", "metadata": str(item)}
+    config = {
+        "scenes": {"town": told},
+        "train": {"own": ["town", {**told, "name": "other"}], "scene": "town", "tiles": 5},
+    }
+    found = recipe.recipe(config, tmp_path)
+    for name in ("town", "other"):
+        assert found.own[name]["view_azimuth"] == pytest.approx(200.0)
+        assert found.own[name]["view_elevation"] == pytest.approx(70.0)
+        assert "metadata" not in found.own[name]
+    assert "--view-azimuth=200.0" in found.training["both"]
+    config["scenes"]["town"]["view_azimuth"] = 10.0  # what is set itself comes first
+    assert recipe.recipe(config, tmp_path).own["town"]["view_azimuth"] == 10.0
+
+
 @pytest.mark.parametrize(
     ("train", "message"),
     [
+        ({"own": [{"raster": "a.tif", "dtm": 1, "truth": "t.gpkg", "regions": "r.gpkg"}]}, "has regions"),
         ({"own": ["nowhere"]}, "no scene 'nowhere'"),
         ({"own": [{"raster": "a.tif", "dtm": 1}]}, "truth .* or buildings"),
         ({"own": [{"raster": "a.tif", "truth": "t.gpkg"}]}, "has no dtm"),

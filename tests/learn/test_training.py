@@ -131,6 +131,18 @@ def test_a_network_for_sections_sees_the_ground_at_a_quarter_metre(task, gsd, zo
     assert training.usual_zoom(task, gsd) == zoom
 
 
+@pytest.mark.parametrize(
+    ("task", "gsd", "zoom"), [("sections", 0.38, 2), ("sections", 0.25, 1.5), ("corners", 0.38, 1)]
+)
+def test_weights_see_the_ground_as_before(tmp_path, task, gsd, zoom):
+    before = SETTINGS._replace(task="sections", zoom=2.0, gsd=0.38)
+    torch.save({"average": {}, "settings": before._asdict()}, tmp_path / "sections.pt")
+    assert training.usual_zoom(task, gsd, tmp_path / "sections.pt") == zoom
+    both = before._replace(task="both", zoom=1.0)  # whose features both tasks share at the image's own scale
+    torch.save({"average": {}, "settings": both._asdict()}, tmp_path / "both.pt")
+    assert training.usual_zoom(task, gsd, tmp_path / "both.pt") == training.usual_zoom(task, gsd)
+
+
 def test_weights_that_are_no_numbers_are_refused(tmp_path):
     model = training.network()
     average = model.state_dict()
