@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kibs_steps import cli, failures, imagery, inputs, scene
+from kibs_steps import cli, failures, imagery, inputs, scene, sources
 from kibs_steps import plan as plans
 from kibs_steps.models import runtime
 from kibs_steps.plan import Plan
@@ -93,7 +93,7 @@ def doubts(plan: Plan, results: Path, needed: float) -> list[str]:
             found.append(f"{facts['dtype']} values are brought to 8 bit from {ranges} (1st to 99th percentile)")
         if settings.get("view_azimuth") is None:
             found.append("view angles unknown: roofs are not moved to where they stand")
-        if not plan.terrain_files:
+        if not plan.terrain_files and not sources.is_remote(plan.dtm):
             found.append(f"the ground is taken as level at {float(plan.dtm):g} m")
     if plan.truth is None and settings.get("simulate") is None:
         found.append("no truth is given: nothing says how good the result is")

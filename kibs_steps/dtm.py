@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import rasterio
 
 AROUND = 250.0  # metres of terrain around the scene, and how far a hole's pixels may be from data
-HIGHEST = 9000.0
+LOWEST, HIGHEST = -500.0, 9000.0  # m; the Dead Sea's shore lies at -430
 STRIP = 512
 REACH = 64  # pixels over which a strip's own neighbours fill a hole; what is farther is filled from a coarse copy
 COARSE = 1024
@@ -61,18 +61,19 @@ class Canvas(NamedTuple):
     rows: Callable[[int, int], np.ndarray]
 
 
-def write(dtm: str | Path | float, grid: Grid, footprint: np.ndarray, path: str | Path) -> dict:
+def write(dtm: str | Path | float, grid: Grid, footprint: np.ndarray, path: str | Path, what: str = "dtm") -> dict:
     """Write `dtm.tif` for a scene of that grid, whose raster covers the ring `footprint` (n, 2 map metres).
 
-    Returns the record for `scene.json`: `source`, `step` (m) and `filled`, the share of the footprint without own data.
+    `what` is the setting that errors name. Returns the record for `scene.json`: `source`, `step` (m) and `filled`, the share of
+    the footprint without own data.
     Raises `DtmMissing`, `DtmPartial` (with the uncovered share), `DtmAbsurd`.
     """
     try:
         height = float(str(dtm))
     except ValueError:
-        with _opened(str(dtm)) as source, _canvas(source, grid) as canvas:
-            area = _covered_area(source, grid, footprint, canvas)
-            coarse, filled = _survey(canvas, area, source.name)
+        with _opened(str(dtm), what) as source, _canvas(source, grid) as canvas:
+            area = _covered_area(source, grid, footprint, canvas, what)
+            coarse, filled = _survey(canvas, area, f"{what} {source.name}")
             with _writing(path, canvas, grid.crs) as target:
                 _fill(canvas, coarse, target)
         return {"source": str(dtm), "step": [canvas.transform.a, -canvas.transform.e], "filled": round(filled, 6)}
@@ -87,41 +88,43 @@ def write(dtm: str | Path | float, grid: Grid, footprint: np.ndarray, path: str 
 
 def check_number(height: float) -> None:
     """Raise `DtmAbsurd` for a number that is no height (m) on Earth."""
-    if not abs(height) <= HIGHEST:
+    if not LOWEST <= height <= HIGHEST:
         raise DtmAbsurd(
             f"dtm={height:g}: the ground cannot be {height:g} m high; give metres above the scene's vertical datum"
         )
 
 
-def check(dtm: str, grid: Grid, footprint: np.ndarray, vertical_crs: str | None = None) -> list[str]:
+def check(dtm: str, grid: Grid, footprint: np.ndarray, vertical_crs: str | None = None, what: str = "dtm") -> list[str]:
     """Look at a terrain model, a number or a file's header: placed, in a known unit and datum, as large as the scene.
 
-    Returns what is doubtful. Raises `DtmMissing`, `DtmPartial`, `DtmAbsurd`, `DtmDatum`.
+    `what` is the setting that errors name. Returns what is doubtful. Raises `DtmMissing`, `DtmPartial`, `DtmAbsurd`, `DtmDatum`.
     """
     try:
         check_number(float(dtm))
     except ValueError:
-        with _opened(dtm) as source:
-            return _doubts(source, grid, footprint, vertical_crs)
+        with _opened(dtm, what) as source:
+            return _doubts(source, grid, footprint, vertical_crs, what)
     return []
 
 
-def _doubts(source: rasterio.DatasetReader, grid: Grid, footprint: np.ndarray, vertical_crs: str | None) -> list[str]:
+def _doubts(
+    source: rasterio.DatasetReader, grid: Grid, footprint: np.ndarray, vertical_crs: str | None, what: str
+) -> list[str]:
     imagery.complete(source)
     with _canvas(source, grid) as canvas:
-        _covered_area(source, grid, footprint, canvas)
-    _check_datum(source, vertical_crs)
+        _covered_area(source, grid, footprint, canvas, what)
+    _check_datum(source, vertical_crs, what)
     crs = imagery.crs_of(source)
     in_feet = crs.is_projected and crs.axis_info[0].unit_conversion_factor != 1.0
     if in_feet and not (source.units[0] or "").strip() and metres_per_unit(source) == 1.0:
         return [
-            f"dtm {source.name} is in a CRS in feet and does not say its heights' unit: metres are assumed; if they are feet, "
+            f"{what} {source.name} is in a CRS in feet and does not say its heights' unit: metres are assumed; if they are feet, "
             "say so (gdal_edit.py -units ft)"
         ]
     return []
 
 
-def _check_datum(source: rasterio.DatasetReader, vertical_crs: str | None) -> None:
+def _check_datum(source: rasterio.DatasetReader, vertical_crs: str | None, what: str) -> None:
     """Refuse a terrain model that says another vertical datum than `vertical_crs`."""
     import pyproj
 
@@ -138,19 +141,20 @@ def _check_datum(source: rasterio.DatasetReader, vertical_crs: str | None) -> No
         return
     if not same:
         raise DtmDatum(
-            f"dtm {source.name} has {called}, vertical_crs={vertical_crs} is {wanted.name}: convert the terrain model (gdalwarp "
-            "-t_srs with a compound CRS), or give the vertical_crs it has"
+            f"{what} {source.name} has {called}, vertical_crs={vertical_crs} is {wanted.name}: convert the terrain model "
+            "(gdalwarp -t_srs with a compound CRS), or give the vertical_crs it has"
         )
 
 
 @contextlib.contextmanager
-def _opened(path: str):
+def _opened(path: str, what: str):
     try:
         with imagery.opened(path) as source:
             imagery.crs_of(source)
             yield source
     except (imagery.RasterMissing, imagery.NotARaster, imagery.NotGeoreferenced) as error:
-        raise DtmMissing(f"dtm: {error}; or give one height in metres, as in dtm=120") from error
+        instead = "; or give one height in metres, as in dtm=120" if what == "dtm" else ""
+        raise DtmMissing(f"{what}: {error}{instead}") from error
 
 
 def metres_per_unit(source: rasterio.DatasetReader) -> float:
@@ -243,7 +247,7 @@ def _step(source: rasterio.DatasetReader, grid: Grid) -> tuple[float, float]:
     return float(np.hypot(x[1] - x[0], y[1] - y[0])), float(np.hypot(x[2] - x[0], y[2] - y[0]))
 
 
-def _covered_area(source: rasterio.DatasetReader, grid: Grid, footprint: np.ndarray, canvas: Canvas):
+def _covered_area(source: rasterio.DatasetReader, grid: Grid, footprint: np.ndarray, canvas: Canvas, what: str):
     """The raster's footprint within the grid (shapely polygon); raises `DtmPartial` where the DTM ends before it does."""
     import pyproj
     import shapely
@@ -252,13 +256,13 @@ def _covered_area(source: rasterio.DatasetReader, grid: Grid, footprint: np.ndar
     extent = shapely.Polygon(imagery.outline(source, pyproj.CRS.from_user_input(grid.crs)))
     outside = area.difference(extent.buffer(max(canvas.transform.a, -canvas.transform.e)))
     if outside.area > 1e-6 * area.area:
-        raise DtmPartial(_partial(source.name, outside.area / area.area))
+        raise DtmPartial(_partial(f"{what} {source.name}", outside.area / area.area))
     return area
 
 
 def _partial(name: str, share: float) -> str:
     return (
-        f"dtm {name} leaves {max(100 * share, 0.01):.2f} % of the scene uncovered: give a terrain model that covers the "
+        f"{name} leaves {max(100 * share, 0.01):.2f} % of the scene uncovered: give a terrain model that covers the "
         "raster (better 250 m more on all sides), clip the scene to it (aoi), or give one height in metres"
     )
 
@@ -276,10 +280,10 @@ def _survey(canvas: Canvas, area, name: str) -> tuple[np.ndarray, float]:
             [area], heights.shape, canvas.transform * Affine.translation(0, top), invert=True, all_touched=True
         )
         missing, total = missing + int((np.isnan(heights) & inside).sum()), total + int(inside.sum())
-        absurd = heights[np.abs(heights) > HIGHEST]
+        absurd = heights[(heights < LOWEST) | (heights > HIGHEST)]
         if absurd.size:
             raise DtmAbsurd(
-                f"dtm {name} holds heights like {absurd[0]:g} m: if that marks missing data, declare it "
+                f"{name} holds heights like {absurd[0]:g} m: if that marks missing data, declare it "
                 f"(gdal_edit.py -a_nodata {absurd[0]:g}); if heights are not in metres, convert them"
             )
         kept = slice(-top % every, None, every)

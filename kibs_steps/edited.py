@@ -26,11 +26,20 @@ from kibs_steps.heightmap import EMPTY
 from kibs_steps.stitch import SECTIONS, distinct_corners, owner_blocks, section_ids, touches_edge
 
 LAYER = "roof_sections_image"
+UNREADABLE = "sections {path} cannot be read ({error}): give the edited city.gpkg or a GeoPackage"
+EMPTY_LAYER = f"sections {{path}} holds no polygons: give the layer {LAYER} as edited"
 SAME = 1e-4  # px: an outline that moved less was not touched
 
 
 class SectionsUnusable(KibsError):
     """A layer of edited sections that cannot be read as polygons."""
+
+
+def layer_of(path: str | Path) -> str | None:
+    """The layer that holds the sections: that of `city.gpkg`, else a file's first."""
+    import pyogrio
+
+    return LAYER if LAYER in [str(name) for name, _ in pyogrio.list_layers(path)] else None
 
 
 def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
@@ -39,15 +48,12 @@ def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     import pyogrio
 
     try:
-        layers = [str(name) for name, _ in pyogrio.list_layers(path)]
-        frame = geopandas.read_file(path, layer=LAYER if LAYER in layers else layers[0])
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, IndexError) as error:
-        raise SectionsUnusable(
-            f"sections {path} cannot be read ({error}): give the edited city.gpkg or a GeoPackage"
-        ) from error
+        frame = geopandas.read_file(path, layer=layer_of(path))
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise SectionsUnusable(UNREADABLE.format(path=path, error=error)) from error
     frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].explode(ignore_index=True)
     if frame.empty:
-        raise SectionsUnusable(f"sections {path} holds no polygons: give the layer {LAYER} as edited")
+        raise SectionsUnusable(EMPTY_LAYER.format(path=path))
     if frame.crs is None:
         raise SectionsUnusable(f"sections {path} says no CRS: assign {grid.crs.splitlines()[0]}")
     frame = frame.to_crs(grid.crs)

@@ -6,10 +6,12 @@ touching it costs one more reading, not a rerun.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from kibs_steps import store
 from kibs_steps.errors import KibsError
@@ -33,6 +35,40 @@ def of_file(path: str | Path, cache: str | Path) -> str:
         known[key] = digest.hexdigest()
         store.write_json(cache, known)
     return known[key]
+
+
+def of_source(path: str | Path, cache: str | Path) -> str | list[str]:
+    """What stands for the content of a raster or a vector file: its sha256, and those of the files that belong to it.
+
+    A folder (File Geodatabase) is all its files.
+    """
+    path = Path(path)
+    own = [path] if path.is_file() else []
+    every = [of_file(file, cache) for file in [*own, *companions(path)]]
+    return every[0] if own and len(every) == 1 else every
+
+
+def companions(path: Path) -> list[Path]:
+    """The files here that hold a part of what a file shows: rasters of a VRT, tables of a shapefile, all of a folder."""
+    if path.is_dir():
+        return sorted(file for file in path.rglob("*") if file.is_file() and file.suffix != ".lock")
+    if path.suffix.lower() == ".shp":
+        parts = {".dbf", ".prj", ".cpg"}
+        return sorted(f for f in path.parent.glob(f"{glob.escape(path.stem)}.*") if f.suffix.lower() in parts)
+    if path.suffix.lower() != ".vrt":
+        return []
+    try:
+        named = list(ElementTree.parse(path).iter())
+    except (ElementTree.ParseError, OSError):
+        return []  # who reads it says what is wrong
+    found: list[Path] = []
+    for element in named:
+        if element.tag in ("SourceFilename", "SourceDataset") and element.text:
+            relative = element.get("relativeToVRT") == "1"
+            part = path.parent / element.text if relative else Path(element.text)
+            if part.is_file() and part not in found:
+                found += [part, *(p for p in companions(part) if p not in found)]
+    return found
 
 
 def of_values(*values: Any) -> str:

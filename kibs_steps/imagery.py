@@ -198,7 +198,9 @@ def colour_bands(source: rasterio.DatasetReader, chosen: tuple[int, ...] | None 
 
 
 def _colour(description: str | None) -> str:
-    found = re.search(r"\b(red|green|blue)\b(?![\s_-]*edge)", (description or "").lower())
+    # "Red Edge", "Deep Blue" and "Coastal Blue" are bands beside red and blue.
+    words = re.sub(r"[\W_]+", " ", (description or "").lower())
+    found = re.search(r"(?<!deep )(?<!coastal )\b(red|green|blue)\b(?! edge)", words)
     return found.group(1) if found else ""
 
 
@@ -208,7 +210,7 @@ def nodata_of(source: rasterio.DatasetReader) -> float | None:
     Without a declared value or a mask, integers of more than 8 bit take 0 (the vendors' fill) and floats NaN.
     """
     if source.nodata is not None:
-        return float(source.nodata)
+        return float(source.nodata) if np.isfinite(source.nodata) else float("nan")
     if _masked(source) or source.dtypes[0] in ("uint8", "int8"):
         return None
     return 0.0 if np.issubdtype(source.dtypes[0], np.integer) else float("nan")
@@ -218,6 +220,12 @@ def _masked(source: rasterio.DatasetReader) -> bool:
     from rasterio.enums import MaskFlags
 
     return any(MaskFlags.per_dataset in flags for flags in source.mask_flag_enums)
+
+
+def _alpha(source: rasterio.DatasetReader) -> int | None:
+    """The number of the alpha band, if there is one."""
+    names = [colour.name for colour in source.colorinterp]
+    return names.index("alpha") + 1 if "alpha" in names else None
 
 
 def has_data(values: np.ndarray, nodata: float | None) -> np.ndarray:
@@ -236,7 +244,9 @@ def read(
     with reading(source, region.get("window", "full size")):
         values = source.read(list(bands), out_shape=shape and (len(bands), *shape), **region)
         valid = has_data(values, nodata)
-        if _masked(source):
+        if (alpha := _alpha(source)) is not None:  # GDAL's own mask leaves it out where a nodata value is declared too
+            valid &= source.read(alpha, out_shape=shape, **region) > 0
+        elif _masked(source):
             valid &= source.dataset_mask(out_shape=shape, **region) > 0
     return values, valid
 

@@ -28,7 +28,7 @@ def check(plan: Plan, results: Path) -> list[str]:
     """Refuse what a scene cannot be made from; returns what is doubtful. Raises the named errors of docs/inputs.md."""
     import pyproj
 
-    from kibs_steps import dtm, imagery, scene
+    from kibs_steps import dtm, imagery, regions, scene
 
     writable(results / plan.name)
     settings = plan.settings
@@ -37,17 +37,30 @@ def check(plan: Plan, results: Path) -> list[str]:
     grid = scene.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))
     for name, lowest in (("view", 20.0), ("sun", 5.0)):
         scene.direction(settings.get(f"{name}_azimuth"), settings.get(f"{name}_elevation"), grid, name, lowest)
-    scene.check_vertical(settings.get("vertical_crs"))
-    doubts = []
+    vertical = settings.get("vertical_crs")
+    scene.check_vertical(vertical)
+    lacking = scene.missing_geoid(grid.crs, vertical)
+    doubts = [
+        f"PROJ lacks the geoid {lacking}: 3D Tiles take heights of {vertical} from the ellipsoid, up to 100 m off; fetch it "
+        f"(pyproj sync --file {lacking}, or PROJ_NETWORK=ON)"
+        if lacking
+        else ""
+    ]
     with imagery.opened(plan.raster) as source:
         imagery.complete(source)
         doubts.append(imagery.colour_bands(source, bands_of(settings))[1])
         footprint = imagery.outline(source, pyproj.CRS.from_user_input(grid.crs))
-    doubts += dtm.check(plan.dtm, grid, footprint, settings.get("vertical_crs"))
+    doubts += dtm.check(plan.dtm, grid, footprint, vertical)
+    if settings.get("dsm"):
+        doubts += dtm.check(settings["dsm"], grid, footprint, vertical, "dsm")
+    if settings.get("regions"):
+        regions.read(settings["regions"], grid)
     if plan.truth:
         check_truth(plan.truth, settings["truth_frame"], grid)
     if settings.get("footprints"):
         check_footprints(settings["footprints"])
+    if settings.get("sections"):
+        check_sections(settings["sections"])
     return [doubt for doubt in doubts if doubt]
 
 
@@ -100,6 +113,20 @@ def check_truth(path: str, frame: str, grid: Any) -> None:
 
 def _finite(value: float) -> bool:
     return value == value and abs(value) != float("inf")
+
+
+def check_sections(path: str) -> None:
+    """Look at the header of a layer of edited sections; raises what `edited` raises."""
+    import pyogrio
+
+    from kibs_steps import edited
+
+    try:
+        facts = pyogrio.read_info(path, layer=edited.layer_of(path))
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise edited.SectionsUnusable(edited.UNREADABLE.format(path=path, error=error)) from error
+    if facts["features"] == 0:
+        raise edited.SectionsUnusable(edited.EMPTY_LAYER.format(path=path))
 
 
 def check_footprints(path: str) -> None:

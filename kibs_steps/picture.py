@@ -44,7 +44,7 @@ def overview(scene: Scene, longest: int) -> tuple[NDArray[np.uint8], float]:
             with tiles.on_grid(source, coarse.part(window), scene.nodata) as warped:
                 values = warped.read([*scene.bands, warped.colorinterp.index(ColorInterp.alpha) + 1])
             part = imagery.stretched(values[:3], scene.stretch).transpose(1, 2, 0).copy()
-            part[values[3] == 0] = PAPER
+            part[~((values[3] > 0) & imagery.has_data(values[:3], None))] = PAPER
             rgb[window.row : window.row + window.height, window.col : window.col + window.width] = part
     return rgb, scale
 

@@ -174,7 +174,7 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
         raster, dtm = sources.place(raster), sources.place(str(dtm))
         width, height = grid_size(raster, terms["gsd"], settings.get("aoi"))
         source = [sources.content(f, cache) for f in (raster, dtm)]
-        truth_source = fingerprint.of_file(truth, cache) if truth and Path(truth).is_file() else truth
+        truth_source = fingerprint.of_source(truth, cache) if truth and Path(truth).exists() else truth
     if settings["feed"] == "truth" and not truth:
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
     blocks = tiling.blocks(width, height)
@@ -292,7 +292,7 @@ def signatures(
 
     def content(key: str) -> Any:
         value = settings.get(key)
-        return fingerprint.of_file(value, cache) if value and Path(value).is_file() else value
+        return fingerprint.of_source(value, cache) if value and Path(value).exists() else value
 
     angles = [some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"), content("regions")]
     seen: dict[str, Any] = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}

@@ -41,8 +41,12 @@ def read(path: str | Path, grid: Grid) -> tuple[Region, ...]:
     frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].to_crs(grid.crs)
     if frame.empty:
         raise RegionsUnusable(f"regions {path} holds no polygon: draw the parts of the image that share a view")
-    if frame[["view_azimuth", "view_elevation"]].isna().any(axis=None):
+    try:
+        azimuth, elevation = (frame[name].astype(float) for name in ("view_azimuth", "view_elevation"))
+    except (TypeError, ValueError) as error:
+        raise RegionsUnusable(f"regions {path}: an angle is no number ({error}): give degrees, as in 181.1") from error
+    if azimuth.isna().any() or elevation.isna().any():
         raise RegionsUnusable(f"regions {path}: a polygon has no view_azimuth or view_elevation: fill in both")
     outlines = shapely.make_valid(shapely.force_2d(frame.geometry.to_numpy()))
-    angles = zip(frame["view_azimuth"].astype(float), frame["view_elevation"].astype(float), strict=True)
+    angles = zip(azimuth, elevation, strict=True)
     return tuple(Region(o, direction(*a, grid, "view")) for o, a in zip(outlines, angles, strict=True))

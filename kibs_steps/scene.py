@@ -417,19 +417,50 @@ def build(
 
 
 def check_vertical(vertical_crs: str | None) -> None:
-    """Raise `VerticalCrsUnusable` for a vertical CRS that is none."""
+    """Raise `VerticalCrsUnusable` for a vertical CRS that is none, is more than that, or does not count in metres."""
     import pyproj
+
+    from kibs_steps import imagery
 
     if vertical_crs is None:
         return
     try:
-        vertical = pyproj.CRS.from_user_input(vertical_crs).is_vertical
+        found = pyproj.CRS.from_user_input(vertical_crs)
     except pyproj.exceptions.CRSError:
-        vertical = False
-    if not vertical:
+        found = None
+    if found is None or not found.is_vertical:
         raise VerticalCrsUnusable(
             f"vertical_crs={vertical_crs} is no vertical CRS: give one as in EPSG:5773 (EGM96 height)"
         )
+    if found.is_compound:
+        part = found.sub_crs_list[1]
+        raise VerticalCrsUnusable(
+            f"vertical_crs={vertical_crs} is a compound CRS: give its vertical part, {imagery.crs_name(part)} ({part.name})"
+        )
+    if found.axis_info[0].unit_conversion_factor != 1.0:
+        raise VerticalCrsUnusable(
+            f"vertical_crs={vertical_crs} counts in {found.axis_info[0].unit_name}, published heights are in metres: give "
+            "the CRS of the same datum in metres (the terrain model may be in feet)"
+        )
+
+
+def missing_geoid(crs: str, vertical_crs: str | None) -> str | None:
+    """The grid that PROJ lacks to tell how high above the ellipsoid the zero of `vertical_crs` lies; None if it can tell."""
+    import warnings
+
+    import pyproj
+
+    if vertical_crs is None:
+        return None
+    flat, up = pyproj.CRS.from_user_input(crs), pyproj.CRS.from_user_input(vertical_crs)
+    whole = pyproj.crs.CompoundCRS(f"{flat.name} + {up.name}", [flat, up])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = pyproj.transformer.TransformerGroup(whole, "EPSG:4978", always_xy=True)
+    if "ballpark vertical" not in found.transformers[0].description:
+        return None
+    grids = [grid.short_name for way in found.unavailable_operations for grid in way.grids if not grid.available]
+    return grids[0] if grids else f"of {up.name}"
 
 
 def _numbers(text: str) -> tuple[int, ...]:

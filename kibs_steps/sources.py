@@ -71,10 +71,11 @@ def version(path: str) -> list[str | None]:
 
 
 def content(path: str, cache: str | Path) -> str | list[str | None]:
-    """What a signature holds of a source: the content's hash of a file, `version` of a URL, the name of what is missing."""
+    """What a signature holds of a source: the content's hash of a file (of several, if it names others), `version` of a URL, the
+    name of what is missing."""
     if is_remote(path):
         return version(path)
-    return fingerprint.of_file(path, cache) if Path(path).is_file() else path
+    return fingerprint.of_source(path, cache) if Path(path).exists() else path
 
 
 def files(*paths: str) -> list[str]:

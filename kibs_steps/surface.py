@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> None:
     facts = scene.read(args.scene)
     with imagery.opened(facts.raster) as source:
         footprint = imagery.outline(source, pyproj.CRS.from_user_input(facts.grid.crs))
-    dtm.write(args.dsm, facts.grid, footprint, args.out)
+    dtm.write(args.dsm, facts.grid, footprint, args.out, "dsm")
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def _values(source: rasterio.DatasetReader, scene: Scene, window: Window) -> tup
     with imagery.reading(source, place), on_grid(source, scene.grid, scene.nodata) as warped:
         alpha = warped.colorinterp.index(ColorInterp.alpha) + 1
         values = warped.read([*scene.bands, alpha], window=place)
-    return values[:3], values[3] > 0
+    return values[:3], (values[3] > 0) & imagery.has_data(values[:3], None)
 
 
 def own_offset(source: rasterio.DatasetReader, grid: Grid) -> tuple[int, int] | None:

@@ -16,8 +16,8 @@ from typing import NamedTuple
 from kibs_steps import cli, sums
 from kibs_steps.errors import KibsError
 
-INTERMEDIATE = ("blocks", "stitched", "models", "simulated")
-ALONE = ("scene.json", "dtm.tif", "truth.parquet", "buildings.parquet")
+INTERMEDIATE = ("blocks", "stitched", "edited", "models", "simulated")
+ALONE = ("scene.json", "dtm.tif", "supposed.json", "surface.tif", "truth.parquet", "buildings.parquet")
 OTHERS = ("logs", "benchmarks")  # folders whose files nobody reads back
 ASIDE = ".changed"
 

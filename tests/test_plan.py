@@ -135,6 +135,39 @@ def test_fingerprint_survives_a_damaged_cache(tmp_path):
     assert fingerprint.of_file(file, cache) == first
 
 
+def test_what_a_file_stands_for_counts_as_its_content(tmp_path):
+    cache = tmp_path / "cache.json"
+    part, other = tmp_path / "part.tif", tmp_path / "deep/other.tif"
+    other.parent.mkdir()
+    part.write_bytes(b"a")
+    other.write_bytes(b"b")
+    whole, inner = tmp_path / "whole.vrt", other.with_suffix(".vrt")
+    source = '<VRTDataset><SourceFilename relativeToVRT="1">{}</SourceFilename></VRTDataset>'
+    inner.write_text(source.format("other.tif"))
+    whole.write_text(source.format("part.tif"))
+    assert fingerprint.companions(whole) == [part]
+    whole.write_text(
+        f'<V><SourceFilename relativeToVRT="1">part.tif</SourceFilename><SourceDataset relativeToVRT="0">{inner}</SourceDataset>'
+        "<SourceFilename>/vsicurl/https://nowhere/x.tif</SourceFilename></V>"
+    )
+    assert fingerprint.companions(whole) == [part, inner, other]
+    first = fingerprint.of_source(whole, cache)
+    other.write_bytes(b"c")
+    assert fingerprint.of_source(whole, cache) != first
+    whole.write_text("no xml")
+    assert fingerprint.companions(whole) == []
+    for end in ("shp", "dbf", "prj", "sbn"):
+        (tmp_path / f"roofs[1].{end}").write_bytes(end.encode())
+    shape = tmp_path / "roofs[1].shp"
+    before = fingerprint.of_source(shape, cache)
+    (tmp_path / "roofs[1].sbn").write_bytes(b"an index")
+    assert fingerprint.of_source(shape, cache) == before
+    (tmp_path / "roofs[1].dbf").write_bytes(b"other angles")
+    assert fingerprint.of_source(shape, cache) != before
+    assert fingerprint.of_source(part, cache) == fingerprint.of_file(part, cache)
+    assert fingerprint.of_source(other.parent, cache) == [fingerprint.of_file(f, cache) for f in (other, inner)]
+
+
 def test_edited_sections_and_a_surface_model_start_where_they_are_used(files):
     folder, _ = files
     for name in ("edit.gpkg", "dsm.tif", "regions.gpkg"):

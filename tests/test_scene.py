@@ -170,6 +170,16 @@ class TestBands:
         colours = (ColorInterp.blue, ColorInterp.green, ColorInterp.red, ColorInterp.undefined)
         assert self.bands(tmp_path, 4, colours=colours) == ((3, 2, 1), "")
 
+    @pytest.mark.parametrize(
+        ("names", "bands"),
+        [
+            (("Deep Blue", "Blue", "Green", "Red", "Red Edge", "NIR"), (4, 3, 2)),
+            (("coastal_blue", "blue", "green", "yellow", "red", "red-edge", "nir1", "nir2"), (5, 3, 2)),
+        ],
+    )
+    def test_bands_beside_blue_are_not_blue(self, tmp_path, names, bands):
+        assert self.bands(tmp_path, len(names), descriptions=names) == (bands, "")
+
     def test_descriptions(self, tmp_path):
         names = ("Coastal", "Blue (B2)", "Green", "Red Edge", "red-edge 2", "RED", "NIR", "x", "y")
         assert self.bands(tmp_path, 9, descriptions=names) == ((6, 3, 2), "")
@@ -236,6 +246,20 @@ class TestRadiometry:
         with rasterio.open(masked, "r+") as target:
             target.write_mask(alpha[0])
         assert build(tmp_path, masked)[1]["coverage"] == 0.9
+
+    def test_alpha_counts_beside_a_nodata_value(self, tmp_path):
+        alpha = np.full((1, 90, 110), 255, "uint8")
+        alpha[:, :, :11] = 0
+        values = np.concatenate([rasters.picture(), alpha])
+        for gsd in (0.38, 0.3):  # read as it is, and warped
+            _, content = build(tmp_path, rasters.write(tmp_path / f"{gsd}.tif", values, gsd=gsd, nodata=0))
+            assert content["coverage"] == 0.9
+
+    def test_infinite_nodata(self, tmp_path):
+        values = rasters.picture(dtype="float32")
+        values[:, :, :11] = -np.inf
+        _, content = build(tmp_path, rasters.write(tmp_path / "a.tif", values, nodata=float("-inf")))
+        assert content["coverage"] == 0.9
 
     def test_black_is_data_but_doubted(self, tmp_path):
         values = rasters.picture()

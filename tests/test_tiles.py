@@ -151,6 +151,17 @@ class TestMissingData:
         assert (stitched(made, TILING)[1] == valid).all()
         assert (stitched(made, TILING)[0] == rgb).all()
 
+    @pytest.mark.parametrize("gsd", [0.38, 0.3], ids=["own grid", "resampled"])
+    def test_nan_is_missing_beside_a_nodata_value_too(self, tmp_path, gsd):
+        values = rasters.picture(dtype="float32")
+        values[:, :, :10], values[:, :, 10:40] = 9, np.nan
+        made = build(tmp_path, rasters.write(tmp_path / "a.tif", values, nodata=9), gsd)
+        rgb, valid = whole(made)
+        first, cols = 40 * 0.38 / gsd, np.arange(made.grid.width)
+        assert not valid[:, cols < first - 1.5].any()
+        assert valid[2:-2, (cols > first + 3) & (cols < 108)].all()  # warped, NaN spreads as far as the kernel
+        assert (rgb[2:-2, cols > first - 3] > 0).all()
+
     def test_one_black_band_is_not_missing(self, tmp_path):
         values = rasters.picture()
         values[0, :, :40] = 0

@@ -89,10 +89,21 @@ def validate(contract: Any, source: str) -> dict[str, Any]:
                 f"{source}: {name}: its layers do not lead from {len(traits)} traits to one number. Make it anew with "
                 "kibs_steps.learn.joins"
             )
+    lacking = [name for name in thresholds_asked(contract) if name not in contract["thresholds"]]
+    if lacking:
+        raise ContractMismatch(f"{source}: thresholds: {', '.join(lacking)} is not said: decoding needs it")
     heights = contract.get("heights")
     if heights and len(heights["edges"]) != len(heights["centres"]) + 1:
         raise ContractMismatch(f"{source}: heights: {len(heights['centres'])} centres need one edge more")
     return contract
+
+
+def thresholds_asked(contract: dict[str, Any]) -> list[str]:
+    """The thresholds without which a model's outputs cannot be decoded (`models.heads`)."""
+    if contract["head"] == "instances":
+        return ["score", *(["min_area"] if contract["task"] != "corners" else [])]
+    asked = {"sections": ["roof", "min_area"], "corners": ["corner"], "both": ["roof", "min_area", "corner"]}
+    return asked[contract["task"]]
 
 
 def load(path: str | Path, task: str | None = None) -> Model:

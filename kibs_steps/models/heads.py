@@ -62,7 +62,12 @@ def decode_corners(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> 
     """Corners of one tile from the outputs of either head."""
     if contract["head"] == "dense":
         return dense_corners(
-            outputs["corner"][0], outputs["offset"], outputs["height"], contract["heights"], contract["thresholds"]
+            outputs["corner"][0],
+            outputs["offset"],
+            outputs["height"],
+            contract["heights"],
+            contract["thresholds"],
+            contract["tile"],
         )
     return instance_corners(outputs, contract["heights"], contract["thresholds"])
 
@@ -255,18 +260,25 @@ def height_map(outputs: dict[str, np.ndarray], contract: dict[str, Any]) -> tupl
 
 
 def dense_corners(
-    corner: np.ndarray, offset: np.ndarray, height: np.ndarray, heights: dict[str, Any], thresholds: dict[str, float]
+    corner: np.ndarray,
+    offset: np.ndarray,
+    height: np.ndarray,
+    heights: dict[str, Any],
+    thresholds: dict[str, float],
+    side: int,
 ) -> Corners:
-    """Peaks of the corner heatmap (5×5 maxima), moved by the offset map, with the height distribution read there.
+    """Peaks of the corner heatmap (maxima of 5×5 cells), moved by the offset map, with the height distribution read there.
 
-    `corner` (s, s), `offset` (2, s, s) px from the pixel's centre, `height` (B, s/k, s/k) for any stride k.
+    `corner` (s/k, s/k), `offset` (2, s/k, s/k) px of the tile from the cell's centre, `height` (B, s/l, s/l), of a tile of `side`
+    s px, for any strides k and l.
     """
     peak = (corner >= thresholds["corner"]) & (corner >= cv2.dilate(corner, np.ones((5, 5), np.uint8)))
     row, col = np.nonzero(peak)
     score = corner[row, col].astype(np.float64)
-    x = col + 0.5 + offset[0, row, col]
-    y = row + 0.5 + offset[1, row, col]
-    k = corner.shape[0] / height.shape[1]
+    cell = side / len(corner)
+    x = (col + 0.5) * cell + offset[0, row, col]
+    y = (row + 0.5) * cell + offset[1, row, col]
+    k = side / height.shape[1]
     mean, sigma = height_moments(bilinear(height, y / k - 0.5, x / k - 0.5), heights)
     return Corners(x.astype(np.float64), y.astype(np.float64), mean, sigma, score)
 

@@ -35,6 +35,7 @@ PROVIDERS: dict[str, tuple[str, str, dict[str, object]]] = {  # onnxruntime's na
 }
 
 DIRECTED = ("offset", "slope", "centre")  # maps whose two channels are a vector (col, row) of the image
+FULL = ("roof", "edge", "distance", "slope", "centre")  # maps that are needed at every pixel, whatever their stride
 
 Network = Callable[[np.ndarray], dict[str, np.ndarray]]  # image (s, s, 3) uint8 -> named maps, batch axis dropped
 
@@ -106,8 +107,8 @@ def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> C
         feed = {"image": contracts.normalise(rgb, model.contract)}
         if wants_geometry:
             feed["geometry"] = geometry
-        outputs = session.run(names, feed)
-        return {name: (value[0] if dense else value) for name, value in zip(names, outputs, strict=True)}
+        outputs = dict(zip(names, session.run(names, feed), strict=True))
+        return {name: at_pixels(name, value[0], len(rgb)) for name, value in outputs.items()} if dense else outputs
 
     def told(geometry: np.ndarray) -> Network:
         if not dense:
@@ -125,6 +126,21 @@ def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> C
         return network
 
     return told
+
+
+def at_pixels(name: str, maps: np.ndarray, side: int) -> np.ndarray:
+    """Maps (C, s/k, s/k) of a tile of `side` px; those of `FULL` at every pixel (C, s, s), bilinear. Raises `ContractMismatch`
+    where they are no whole part of the tile."""
+    rows, cols = maps.shape[1:]
+    if rows != cols or not rows or side % rows:
+        raise contracts.ContractMismatch(
+            f"output {name} is {cols} x {rows} for a tile of {side} px: it must be square, its side a whole part of the tile's"
+        )
+    if rows == side or name not in FULL:
+        return maps
+    import cv2
+
+    return np.stack([cv2.resize(channel, (side, side), interpolation=cv2.INTER_LINEAR) for channel in maps])
 
 
 class Flip(NamedTuple):

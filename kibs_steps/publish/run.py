@@ -70,17 +70,21 @@ def versions() -> dict[str, str | None]:
 
 
 def inputs(paths: list[str], cache: Path) -> list[dict[str, Any]]:
-    """File, size (bytes) and sha256 of the inputs; `cache` as in `fingerprint.of_file`. Raises `InputMissing`.
+    """File, size (bytes) and sha256 of the inputs and of the files that belong to them (`fingerprint.companions`); `cache` as in
+    `fingerprint.of_file`. Raises `InputMissing`.
 
     Of a remote source what its server says: entity tag, date and length.
     """
     remote = [{"file": path, "version": sources.version(path)[1:]} for path in paths if sources.is_remote(path)]
-    paths = sources.files(*paths)
-    for path in paths:
-        if not Path(path).is_file():
+    found: list[str] = []
+    for path in sources.files(*paths):
+        if not Path(path).exists():
             raise InputMissing(f"input {path} is gone: put it back, or build the scene again from its new place")
+        found += [path] if Path(path).is_file() else []
+        found += map(str, fingerprint.companions(Path(path)))
     return remote + [
-        {"file": path, "bytes": Path(path).stat().st_size, "sha256": fingerprint.of_file(path, cache)} for path in paths
+        {"file": path, "bytes": Path(path).stat().st_size, "sha256": fingerprint.of_file(path, cache)}
+        for path in dict.fromkeys(found)
     ]
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import functools
 import shutil
+import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -161,6 +162,11 @@ def main(argv: list[str] | None = None) -> None:
     left, bottom, right, top = scene.grid.bounds
     vertical = store.read_json(args.scene).get("vertical_crs")
     earth = Earth(scene.grid.crs, vertical, (left + right) / 2, (bottom + top) / 2)
+    if lacking := scenes.missing_geoid(scene.grid.crs, vertical):
+        print(
+            f"warning: PROJ lacks the geoid {lacking}: heights of {vertical} are taken from the ellipsoid",
+            file=sys.stderr,
+        )
     told = {"title": scene.name, "licence": licences.line(args.models)}
     folder = Path(args.out).parent
     making = folder.with_name(f".tmp-{folder.name}")

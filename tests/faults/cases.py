@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import geopandas
 import numpy as np
 import onnx
 import rasterio
@@ -245,6 +246,31 @@ def _(folder):
     return {"vertical_crs": "EPSG:4326"}
 
 
+@case("terrain", "`vertical_crs` that is a compound", "VerticalCrsUnusable",
+      "vertical_crs=EPSG:7415 is a compound CRS: give its vertical part, EPSG:5709 (NAP height)")  # fmt: skip
+def _(folder):
+    return {"vertical_crs": "EPSG:7415"}
+
+
+@case("terrain", "`vertical_crs` in feet", "VerticalCrsUnusable",
+      "vertical_crs=EPSG:6360 counts in US survey foot, published heights are in metres: give the CRS of the same datum in "
+      "metres (the terrain model may be in feet)")  # fmt: skip
+def _(folder):
+    return {"vertical_crs": "EPSG:6360"}
+
+
+@case("terrain", "a surface model that is not there", "DtmMissing",
+      "dsm: raster nowhere.tif does not exist: check the path")  # fmt: skip
+def _(folder):
+    return {"dsm": "nowhere.tif"}
+
+
+@case("terrain", "a surface model smaller than the scene", "DtmPartial",
+      "dsm t.tif leaves … % of the scene uncovered: …")  # fmt: skip
+def _(folder):
+    return {"dsm": str(rasters.dtm(folder / "t.tif", np.full((20, 8), 5, "float32"), rasters.X0, rasters.Y0))}
+
+
 @case("angles", "one of the two", "AnglesUnusable",
       "view_azimuth is given without view_elevation: give both, or neither if it is unknown")  # fmt: skip
 def _(folder):
@@ -333,6 +359,35 @@ def _(folder):
 @case("other layers", "footprints without a CRS", "FootprintsUnusable", "footprints t.gpkg says no CRS: assign one")
 def _(folder):
     return {"footprints": str(vector(folder / "t.gpkg", [shapely.box(*BOX)], None))}
+
+
+@case("other layers", "sections that cannot be read", "SectionsUnusable",
+      "sections nowhere.gpkg cannot be read (…): give the edited city.gpkg or a GeoPackage")  # fmt: skip
+def _(folder):
+    return {"sections": "nowhere.gpkg"}
+
+
+@case("other layers", "regions that cannot be read", "RegionsUnusable",
+      "regions nowhere.gpkg cannot be read as vector data (…): give a GeoPackage or GeoJSON")  # fmt: skip
+def _(folder):
+    return {"regions": "nowhere.gpkg"}
+
+
+@case("other layers", "regions without angles", "RegionsUnusable",
+      "regions t.gpkg lacks the column view_azimuth and view_elevation: each polygon needs both, in degrees")  # fmt: skip
+def _(folder):
+    return {"regions": str(vector(folder / "t.gpkg", [shapely.box(*BOX)]))}
+
+
+@case("other layers", "regions whose angles are no numbers", "RegionsUnusable",
+      "regions t.geojson: an angle is no number (…): give degrees, as in 181.1")  # fmt: skip
+def _(folder):
+    path = folder / "t.geojson"
+    frame = geopandas.GeoDataFrame(
+        {"view_azimuth": ["181,1"], "view_elevation": [60.0]}, geometry=[shapely.box(*BOX)], crs=CRS
+    )
+    frame.to_file(path)
+    return {"regions": str(path)}
 
 
 @case("settings", "a key mistyped", "BadConfig",

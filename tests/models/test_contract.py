@@ -47,6 +47,7 @@ def test_not_a_model(tmp_path):
         ({"surprise": 1}, "surprise"),
         ({"contract": 2}, "contract"),
         ({"input": {"channels": "RGB"}}, "input"),
+        ({"thresholds": {"min_area": 8}}, "thresholds: roof"),
     ],
 )
 def test_bad_contracts(tmp_path, change, message):

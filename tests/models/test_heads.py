@@ -116,15 +116,24 @@ def test_corner_position_and_height(stride):
     offset[:, 10, 20] = 0.3, -0.2
     height = np.zeros((3, 32 // stride, 32 // stride))
     height[0], height[1] = 0.25, 0.75
-    found = heads.dense_corners(corner, offset, height, HEIGHTS, THRESHOLDS)
+    found = heads.dense_corners(corner, offset, height, HEIGHTS, THRESHOLDS, len(corner))
     assert (found.col.tolist(), found.row.tolist()) == ([pytest.approx(20.8)], [pytest.approx(10.3)])
     assert found.height[0] == pytest.approx(1.25)
     assert found.sigma[0] == pytest.approx(np.sqrt(0.25 * 0.75 + 1 / 12))
     assert found.score[0] == pytest.approx(0.9)
 
 
+def test_corners_of_a_coarser_heatmap_lie_where_they_lie():
+    corner = np.zeros((16, 16))
+    corner[5, 10] = 0.9
+    offset = np.zeros((2, 16, 16))
+    offset[:, 5, 10] = 0.4, -0.6
+    found = heads.dense_corners(corner, offset, np.ones((3, 4, 4)) / 3, HEIGHTS, THRESHOLDS, 32)
+    assert (found.col.tolist(), found.row.tolist()) == ([pytest.approx(21.4)], [pytest.approx(10.4)])
+
+
 def test_no_corners_is_an_empty_table():
-    found = heads.dense_corners(np.zeros((8, 8)), np.zeros((2, 8, 8)), np.ones((3, 8, 8)) / 3, HEIGHTS, THRESHOLDS)
+    found = heads.dense_corners(np.zeros((8, 8)), np.zeros((2, 8, 8)), np.ones((3, 8, 8)) / 3, HEIGHTS, THRESHOLDS, 8)
     assert [len(c) for c in found] == [0] * 5
 
 

@@ -51,6 +51,16 @@ def test_flips_leave_a_symmetric_network_alone(tmp_path):
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
+def test_maps_of_any_stride_are_brought_to_pixels():
+    ramp = np.broadcast_to(np.arange(16.0, dtype=np.float32), (2, 16, 16))
+    full = runtime.at_pixels("slope", ramp, 32)
+    assert full.shape == (2, 32, 32)
+    np.testing.assert_allclose(full[0, 7, 2:-2], (np.arange(2, 30) + 0.5) / 2 - 0.5)
+    assert runtime.at_pixels("corner", ramp[:1], 32).shape == (1, 16, 16)
+    with pytest.raises(contract.ContractMismatch, match="output roof is 16 x 16 for a tile of 40 px"):
+        runtime.at_pixels("roof", ramp[:1], 40)
+
+
 class TestProviders:
     def test_one_that_is_not_there_is_told_with_its_package(self, tmp_path):
         """No build of onnxruntime has both: what is asked for is refused, never replaced in silence."""
