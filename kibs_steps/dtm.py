@@ -3,7 +3,7 @@
 In: a number (m), or a raster in any CRS, resolution and unit of height. Out: float32 metres in the scene's CRS over the
 scene and 250 m around it, without holes: a raster in the scene's CRS keeps its own pixels, any other is warped
 (bilinear) at its own resolution; where it has no value, neighbours are interpolated. The work goes in strips, so memory
-does not grow with the raster.
+grows with the raster's width alone.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ LOWEST, HIGHEST = -500.0, 9000.0  # m; the Dead Sea's shore lies at -430
 STRIP = 512
 REACH = 64  # pixels over which a strip's own neighbours fill a hole; what is farther is filled from a coarse copy
 COARSE = 1024
+STAYS = np.zeros((1, 2))  # moves of what stands where it is seen
 METRES = {
     "m": 1.0, "metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0,
     "cm": 0.01, "centimetre": 0.01, "dm": 0.1,
@@ -61,8 +62,17 @@ class Canvas(NamedTuple):
     rows: Callable[[int, int], np.ndarray]
 
 
-def write(dtm: str | Path | float, grid: Grid, footprint: np.ndarray, path: str | Path, what: str = "dtm") -> dict:
+def write(
+    dtm: str | Path | float,
+    grid: Grid,
+    footprint: np.ndarray,
+    path: str | Path,
+    what: str = "dtm",
+    moves: np.ndarray = STAYS,
+) -> dict:
     """Write `dtm.tif` for a scene of that grid, whose raster covers the ring `footprint` (n, 2 map metres).
+
+    Things may stand elsewhere than they are seen: by any of `moves` (m, 2 map metres) or between them.
 
     `what` is the setting that errors name. Returns the record for `scene.json`: `source`, `step` (m) and `filled`, the share of
     the footprint without own data.
@@ -71,19 +81,39 @@ def write(dtm: str | Path | float, grid: Grid, footprint: np.ndarray, path: str 
     try:
         height = float(str(dtm))
     except ValueError:
-        with _opened(str(dtm), what) as source, _canvas(source, grid) as canvas:
-            area = _covered_area(source, grid, footprint, canvas, what)
+        with _opened(str(dtm), what) as source, _canvas(source, grid, moves) as canvas:
+            area = _covered_area(source, grid, footprint, canvas, what, moves)
             coarse, filled = _survey(canvas, area, f"{what} {source.name}")
             with _writing(path, canvas, grid.crs) as target:
                 _fill(canvas, coarse, target)
         return {"source": str(dtm), "step": [canvas.transform.a, -canvas.transform.e], "filled": round(filled, 6)}
     check_number(height)
     left, bottom, right, top = grid.bounds
-    side = max(right - left, top - bottom) + 2 * AROUND
-    canvas = Canvas(Affine(side / 2, 0.0, left - AROUND, 0.0, -side / 2, top + AROUND), 2, 2, lambda first, last: None)
+    left, bottom, right, top = _around(grid, moves)
+    side = max(right - left, top - bottom)
+    canvas = Canvas(Affine(side / 2, 0.0, left, 0.0, -side / 2, top), 2, 2, lambda first, last: None)
     with _writing(path, canvas, grid.crs) as target:
         target.write(np.full((1, 2, 2), height, np.float32))
     return {"source": height, "step": None, "filled": 0.0}
+
+
+def _around(grid: Grid, moves: np.ndarray) -> tuple[float, float, float, float]:
+    """Bounds (left, bottom, right, top) of the scene as seen and as it stands, and of `AROUND` metres about both."""
+    left, bottom, right, top = grid.bounds
+    (west, south), (east, north) = np.minimum(moves.min(axis=0), 0.0), np.maximum(moves.max(axis=0), 0.0)
+    return left + west - AROUND, bottom + south - AROUND, right + east + AROUND, top + north + AROUND
+
+
+def extremes(path: str | Path) -> tuple[float, float]:
+    """The lowest and the highest terrain (m) of a scene's `dtm.tif`."""
+    import rasterio
+
+    low, high = np.inf, -np.inf
+    with rasterio.open(path) as source:
+        for _, window in source.block_windows(1):
+            heights = source.read(1, window=window)
+            low, high = min(low, float(heights.min())), max(high, float(heights.max()))
+    return low, high
 
 
 def check_number(height: float) -> None:
@@ -173,15 +203,14 @@ def metres_per_unit(source: rasterio.DatasetReader) -> float:
 
 
 @contextlib.contextmanager
-def _canvas(source: rasterio.DatasetReader, grid: Grid):
-    """The canvas over the scene and 250 m around it, on the DTM's own pixels where it is in the scene's CRS."""
+def _canvas(source: rasterio.DatasetReader, grid: Grid, moves: np.ndarray = STAYS):
+    """The canvas over the scene, where it stands, and 250 m around it, on the DTM's own pixels where it is in the scene's CRS."""
     import pyproj
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
     from rasterio.windows import Window
 
-    left, bottom, right, top = grid.bounds
-    left, bottom, right, top = left - AROUND, bottom - AROUND, right + AROUND, top + AROUND
+    left, bottom, right, top = _around(grid, moves)
     t, nodata = source.transform, source.nodata
     factor, scale, offset = metres_per_unit(source), source.scales[0], source.offsets[0]
 
@@ -247,14 +276,22 @@ def _step(source: rasterio.DatasetReader, grid: Grid) -> tuple[float, float]:
     return float(np.hypot(x[1] - x[0], y[1] - y[0])), float(np.hypot(x[2] - x[0], y[2] - y[0]))
 
 
-def _covered_area(source: rasterio.DatasetReader, grid: Grid, footprint: np.ndarray, canvas: Canvas, what: str):
+def _covered_area(
+    source: rasterio.DatasetReader, grid: Grid, footprint: np.ndarray, canvas: Canvas, what: str, moves=STAYS
+):
     """The raster's footprint within the grid (shapely polygon); raises `DtmPartial` where the DTM ends before it does."""
     import pyproj
     import shapely
+    from shapely import affinity
 
-    area = shapely.make_valid(shapely.Polygon(footprint)).intersection(shapely.box(*grid.bounds))
+    seen = shapely.make_valid(shapely.Polygon(footprint)).intersection(shapely.box(*grid.bounds))
+    area = (
+        seen if moves is STAYS else shapely.union_all([affinity.translate(seen, *move) for move in moves]).convex_hull
+    )
     extent = shapely.Polygon(imagery.outline(source, pyproj.CRS.from_user_input(grid.crs)))
-    outside = area.difference(extent.buffer(max(canvas.transform.a, -canvas.transform.e)))
+    # What stands a little beyond the terrain model is filled from its rim, what is seen there is not.
+    slack = max(canvas.transform.a, -canvas.transform.e) if moves is STAYS else AROUND
+    outside = area.difference(extent.buffer(slack))
     if outside.area > 1e-6 * area.area:
         raise DtmPartial(_partial(f"{what} {source.name}", outside.area / area.area))
     return area

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 COARSEST = 1.6  # times the model's GSD
 SAME_GSD = 0.005  # a raster whose GSD differs less from the model's is used as it is
+DEGREES = 4326  # EPSG: longitude and latitude in degrees from Greenwich
 SCALE_ERROR = 0.01  # of a projection, beyond which its metres are no metres
 
 
@@ -79,6 +80,7 @@ class Scene(NamedTuple):
     folder: Path
     nodata: float | None = None
     regions: tuple[Region, ...] = ()
+    displaced: float = 0.0  # m, how far from where it is seen the ground itself may stand (`projection_height`)
 
     @property
     def lean(self) -> tuple[float, float]:
@@ -109,8 +111,9 @@ class Scene(NamedTuple):
     def terrain(
         self, bounds: tuple[float, float, float, float], margin: float = 200.0, step: float = 0.0
     ) -> terrain.Terrain:
-        """The DTM around `bounds` (left, bottom, right, top, map metres), no finer than a `step` (m) asks for."""
-        return terrain.read(self.folder / "dtm.tif", bounds, margin, step)
+        """The DTM around `bounds` (left, bottom, right, top, map metres) and where what is seen there stands, no finer than a
+        `step` (m) asks for."""
+        return terrain.read(self.folder / "dtm.tif", bounds, margin + self.displaced, step)
 
     def projected_on(self, dtm: Surface) -> Surface:
         """The surface the image was projected on: the DTM, or the constant `projection_height`."""
@@ -138,6 +141,7 @@ def read(path: str | Path) -> Scene:
         folder=Path(path).parent,
         nodata=None if nodata is None else float(nodata),
         regions=_regions_in(content),
+        displaced=content.get("displaced", 0.0),
     )
 
 
@@ -176,13 +180,15 @@ def own_gsd(raster: str | Path) -> float:
 
 def _scene_crs(source: rasterio.DatasetReader) -> tuple[pyproj.CRS, bool]:
     """The CRS of a raster's scene, and whether it is the raster's own."""
+    import pyproj
+
     from kibs_steps import imagery
 
     crs, t = imagery.crs_of(source), source.transform
     north_up = t.b == 0 and t.d == 0 and t.a > 0 and t.e < 0
     if north_up and _in_true_metres(crs, imagery.outline(source, crs, 1).mean(axis=0)):
         return crs, True
-    longitude, latitude = imagery.outline(source, crs.geodetic_crs, 1).mean(axis=0)
+    longitude, latitude = imagery.outline(source, pyproj.CRS.from_epsg(DEGREES), 1).mean(axis=0)
     return _utm(longitude, latitude), False
 
 
@@ -212,15 +218,28 @@ def _grid_of(source: rasterio.DatasetReader, gsd: float) -> Grid:
 
 def _in_true_metres(crs: pyproj.CRS, centre: np.ndarray) -> bool:
     """Whether a map metre of this CRS is a metre on the ground, within 1 %: not so in feet, degrees and Mercator."""
-    import pyproj
-
     if not crs.is_projected or any(axis.unit_conversion_factor != 1.0 for axis in crs.axis_info):
         return False
     if "Pseudo" in crs.coordinate_operation.method_name:
         return False
-    to_degrees = pyproj.Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True)
-    factors = pyproj.Proj(crs).get_factors(*to_degrees.transform(*centre))
-    return max(abs(factors.meridional_scale - 1.0), abs(factors.parallel_scale - 1.0)) <= SCALE_ERROR
+    east, north = _ground_metre(crs, *centre)
+    return max(abs(np.hypot(*east) - 1.0), abs(np.hypot(*north) - 1.0)) <= SCALE_ERROR
+
+
+def _ground_metre(crs: pyproj.CRS, x: float, y: float, step: float = 10.0) -> np.ndarray:
+    """What a metre on the ground is in map axes (x, y) at a place: towards true east and true north, (2, 2).
+
+    By steps of some metres both ways: a CRS's own degrees may be grads from Paris, and then its factors are no help.
+    """
+    import pyproj
+
+    to_degrees = pyproj.Transformer.from_crs(crs, DEGREES, always_xy=True)
+    longitude, latitude = to_degrees.transform(x, y)
+    places = np.array(
+        pyproj.Geod(ellps="WGS84").fwd([longitude] * 4, [latitude] * 4, [90, 270, 0, 180], [step] * 4)[:2]
+    )
+    east, west, north, south = np.column_stack(to_degrees.transform(*places, direction="INVERSE"))
+    return np.stack([east - west, north - south]) / (2 * step)
 
 
 def _utm(longitude: float, latitude: float) -> pyproj.CRS:
@@ -302,9 +321,8 @@ def convergence(grid: Grid) -> float:
 
     crs = pyproj.CRS.from_user_input(grid.crs)
     left, bottom, right, top = grid.bounds
-    to_degrees = pyproj.Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True)
-    place = to_degrees.transform((left + right) / 2.0, (bottom + top) / 2.0)
-    return float(pyproj.Proj(crs).get_factors(*place).meridian_convergence)
+    _, (x, y) = _ground_metre(crs, (left + right) / 2.0, (bottom + top) / 2.0)
+    return round(float(np.degrees(np.arctan2(-x, y))), 6)
 
 
 def facts(source: rasterio.DatasetReader, gsd: float, bands: tuple[int, ...] | None = None) -> dict[str, Any]:
@@ -392,7 +410,8 @@ def build(
     if not shapely.Polygon(footprint).intersection(shapely.box(*grid.bounds)).area:
         raise AoiUnusable(f"aoi {aoi} lies beside the raster {raster}, which is turned in its CRS: move it")
     doubts = terrain_model.check(str(dtm), grid, footprint, vertical_crs)
-    ground = terrain_model.write(dtm, grid, footprint, Path(folder) / "dtm.tif")
+    leans = [d.lean for d in (directions["view"], *(part.view for part in parts)) if d]
+    ground, displaced = _ground(dtm, grid, footprint, Path(folder) / "dtm.tif", projection_height, leans)
     warnings = found.pop("warnings") + doubts
     if ground["filled"]:
         warnings.append(
@@ -406,6 +425,7 @@ def build(
         **{key: d and d._asdict() for key, d in directions.items()},
         "projection_height": projection_height,
         "vertical_crs": vertical_crs,
+        "displaced": round(displaced, 3),
         "dtm": ground,
         "regions": [{"outline": shapely.to_wkt(r.outline, rounding_precision=3), **r.view._asdict()} for r in parts],
         "warnings": warnings,
@@ -414,6 +434,35 @@ def build(
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
     return read(Path(folder) / "scene.json")
+
+
+def _ground(
+    dtm: str | Path | float,
+    grid: Grid,
+    footprint: np.ndarray,
+    path: Path,
+    projection_height: float | None,
+    leans: list[tuple[float, float]],
+) -> tuple[dict[str, Any], float]:
+    """Writes `dtm.tif` as far as all stands that the raster shows: its record, and how far (m) it is from where it is seen.
+
+    An image projected on one height shows ground of height T moved by (T − that height) times the lean. How high the ground is
+    there is only known once it is read, so it is written again until it reaches as far as its own heights ask for.
+    """
+    from kibs_steps import dtm as terrain_model
+
+    record = terrain_model.write(dtm, grid, footprint, path)
+    if projection_height is None or not leans:
+        return record, 0.0
+    moves = terrain_model.STAYS
+    for _ in range(8):
+        above = np.array(terrain_model.extremes(path)) - projection_height
+        wanted = (above[:, None, None] * np.array(leans)[None]).reshape(-1, 2)
+        if len(moves) == len(wanted) and np.allclose(moves, wanted):
+            break
+        moves = wanted
+        record = terrain_model.write(dtm, grid, footprint, path, moves=moves)
+    return record, float(np.hypot(*moves.T).max())
 
 
 def check_vertical(vertical_crs: str | None) -> None:

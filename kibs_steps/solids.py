@@ -23,12 +23,12 @@ import shapely
 from kibs_steps import cli, clip, features, gate, mesh, scene, shells, store, straight
 from kibs_steps.buildings import hidden
 from kibs_steps.errors import KibsError
-from kibs_steps.faces import MM, Face, NoPartition, Point, directed_edges, dissolved, shapes_of
+from kibs_steps.faces import MM, Face, NoPartition, Point, dissolved, shapes_of
 from kibs_steps.features import roof_type
 from kibs_steps.partition import GAP, REACH, partition, polygonal
 from kibs_steps.planes import middle_of
 from kibs_steps.planes_together import SLOPE_CAP, bring_together, drawn_to_planes
-from kibs_steps.shells import GROUND, Surface
+from kibs_steps.shells import GROUND, WALL, Surface
 from kibs_steps.terrain import Terrain
 
 FITTED = ("ok", "raster_edge", "cloud_or_nodata")  # statuses whose plane was fitted to enough corners
@@ -38,6 +38,7 @@ DRAWN = 0.3  # m, how well drawn outlines fit each other
 MEETING = 1.5  # px, outlines this near in the image meet there
 ALONG = 8.0  # px, longer common edges are no chance
 WHOLE = 10.0  # px², outlines over each other by more show parts that are hidden
+TOUCHING = 1.5  # mm, walls this near stand along each other
 ONE_LEVEL = 0.1  # m, flat sections this near in height are one level
 CANNOT = (NoPartition, shapely.errors.GEOSException, np.linalg.LinAlgError, ValueError)  # what bad geometry ends in
 
@@ -93,7 +94,7 @@ class Fit(NamedTuple):
 class Solid(NamedTuple):
     """A building as published: its shells (mm from the sections' origin), ground (mm), roof type; no shells at LOD "0".
 
-    `party`: edges of its outline (mm, in plan) behind which another building stands.
+    `party`: edges of its outline (mm, in plan) along which another building stands (`with_party_walls`).
     """
 
     lod: str
@@ -163,7 +164,6 @@ def together(
                 for b, mine in ((b, sections.take(rows)) for b, rows in of.items())
             ]
         return [Built(int(names[0]), sections, _undivided(sections, dtm, lod_label, error))]
-    edges = directed_edges(faces)
     found = []
     for b, rows in of.items():
         mine = sections.take(rows)
@@ -174,13 +174,42 @@ def together(
                 Built(b, mine, build(mine, dtm, lod_label, fit) if len(names) > 1 else _nothing(mine, dtm, []))
             )
             continue
-        party = frozenset(
-            (u, v) for (u, v), f in edges.items()
-            if faces[f].section in place and (v, u) in edges and faces[edges[v, u]].section not in place
-        )  # fmt: skip
-        solid = _climb(own, mine, dtm, lod_label)
-        found.append(Built(b, mine, solid._replace(party=party)))
-    return found
+        found.append(Built(b, mine, _climb(own, mine, dtm, lod_label)))
+    return with_party_walls(found)
+
+
+def with_party_walls(found: list[Built]) -> list[Built]:
+    """Buildings of one cluster with their `party` walls: those along which, for half of their length at least, walls of others
+    stand. Asked of what is published: a roof cut where it comes down to the ground leaves its neighbour's wall free."""
+    walls = [(k, *segment) for k, built in enumerate(found) for segment in _outer_walls(built.solid)]
+    if len({k for k, *_ in walls}) < 2:
+        return found
+    owner = np.array([k for k, *_ in walls])
+    lines = shapely.linestrings(np.array([segment for _, *segment in walls], float))
+    one, other = shapely.STRtree(lines).query(lines, "dwithin", TOUCHING)
+    apart = owner[one] != owner[other]
+    one, other = one[apart], other[apart]
+    common = shapely.length(shapely.intersection(lines[one], shapely.buffer(lines[other], TOUCHING, cap_style="flat")))
+    shared = np.bincount(one, common, len(lines)) >= 0.5 * shapely.length(lines)
+    party: list[set[tuple[Point, Point]]] = [set() for _ in found]
+    for (k, start, end), behind in zip(walls, shared, strict=True):
+        if behind:
+            party[k].add((start, end))
+    return [
+        built._replace(solid=built.solid._replace(party=frozenset(edges)))
+        for built, edges in zip(found, party, strict=True)
+    ]
+
+
+def _outer_walls(solid: Solid) -> list[tuple[Point, Point]]:
+    """The edges (mm, in plan) of a solid's outline, each once, as its walls run."""
+    ends = (
+        (surface.rings[0][-1][:2], surface.rings[0][0][:2])
+        for shell in solid.shells
+        for surface in shell
+        if surface.kind == WALL and surface.exterior
+    )
+    return list(dict.fromkeys(ends))
 
 
 def _tiled(sections: Sections, building: np.ndarray, fit: Fit) -> list[Face]:

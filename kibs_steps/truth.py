@@ -23,6 +23,7 @@ from kibs_steps import cli, store, view, zbuffer
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid, Window
+from kibs_steps.planes import middle_of
 from kibs_steps.scene import Scene
 from kibs_steps.view import Plane, Surface
 
@@ -239,10 +240,11 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
     split, visible = layer.columns.get("split"), layer.columns.get("visible")
 
     def taken(column: NDArray | None, kind: pa.DataType, missing: int | None = None) -> pa.Array:
-        if column is None:
+        values = None if column is None else _numbers(column)
+        if values is None:  # a column of that name that means something else, such as OpenStreetMap's building=yes
             return pa.array([missing] * len(rows), kind)
-        values = np.asarray(column[rows], float)
-        return pa.array([missing if np.isnan(v) else v for v in values.tolist()], pa.float64()).cast(kind)
+        known = [missing if np.isnan(v) else v for v in values[rows].tolist()]
+        return pa.array(known, pa.float64()).cast(kind, safe=False)
 
     return pa.table(
         {
@@ -250,15 +252,31 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
             "building": taken(building, pa.int64()),
             "outline_seen": pa.array(shapely.to_wkb(seen), pa.binary()),
             "outline_map": pa.array(shapely.to_wkb(standing), pa.binary()),
-            "split": taken(split, pa.int64(), missing=2),
+            "split": _splits(taken(split, pa.int64(), missing=2)),
             "visible": taken(visible, pa.float64()),
         }
     )
 
 
-def _are_labels(ids: NDArray) -> bool:
+def _numbers(column: NDArray) -> NDArray[np.float64] | None:
+    """A layer's column as numbers, NaN where there is none; None where it holds something else."""
+    try:
+        return np.asarray(column, float)
+    except (TypeError, ValueError):
+        return None
+
+
+def _splits(codes: pa.Array) -> pa.Array:
+    """Codes 0 (training) and 1 (validation) as they are, any other as 2 (testing, or none)."""
+    values = codes.to_numpy()
+    return pa.array(np.where(np.isin(values, (0, 1)), values, 2), pa.int64())
+
+
+def _are_labels(column: NDArray) -> bool:
     """Whether a file's own section ids can be labels of pixels: whole, positive, one per section, below 2³¹."""
-    ids = np.asarray(ids, float)
+    ids = _numbers(column)
+    if ids is None:
+        return False
     fits = np.isfinite(ids).all() and (ids == np.floor(ids)).all() and ids.min() > 0 and ids.max() < 2**31
     return bool(fits) and len(np.unique(ids)) == len(ids)
 
@@ -290,7 +308,8 @@ def read(path: str | Path, scene: Scene) -> Truth:
     box = shapely.bounds(seen)
     # A wall's foot is seen (height · lean) away from its eave, here for the section's highest corner.
     tall = np.maximum.reduceat(*_per_polygon(seen)) if len(seen) else np.zeros(0)
-    foot = np.maximum(tall, 0.0)[:, None] * np.array([scene.lean[0], -scene.lean[1]]) / scene.grid.gsd
+    lean = scene.leans(middle_of(seen, scene))
+    foot = np.maximum(tall, 0.0)[:, None] * lean * [1.0, -1.0] / scene.grid.gsd
     low = np.minimum(box[:, :2], box[:, :2] + foot)
     high = np.maximum(box[:, 2:], box[:, 2:] + foot)
     slack = 2.0  # px, for terrain that changes between a roof and its foot
@@ -344,12 +363,14 @@ def visible_labels(truth: Truth, scene: Scene, window: Window) -> tuple[NDArray[
     terrain = scene.terrain(frame.bounds, margin=500.0)
     projected_on = scene.projected_on(terrain)
 
-    walls = _walls(near.standing, scene.lean, terrain)
+    lean = scene.leans(middle_of(near.seen, scene))
+    walls, wall_of = _walls(near.standing, lean, terrain)
     rings, owner = shapely.get_rings(near.standing, return_index=True)
     points, ring = shapely.get_coordinates(rings, include_z=True, return_index=True)
     # Sheared so that one parallel view over height 0 shows every point where the image does.
     points = np.vstack([walls.reshape(-1, 3), points])
-    seen = view.image_position(points[:, :2], points[:, 2], scene.lean, projected_on)
+    own = lean[np.concatenate([np.repeat(wall_of, 4), owner[ring]])]
+    seen = view.image_position(points[:, :2], points[:, 2], own, projected_on)
     lifted = np.column_stack([seen + points[:, 2:] * scene.lean, points[:, 2]])
     faces = [zbuffer.Polygon(quad) for quad in lifted[: 4 * len(walls)].reshape(-1, 4, 3)]
     parts = [part[:-1] for part in np.split(lifted[4 * len(walls) :], np.flatnonzero(np.diff(ring)) + 1)]
@@ -361,26 +382,31 @@ def visible_labels(truth: Truth, scene: Scene, window: Window) -> tuple[NDArray[
     section = face[rows, cols] - len(walls)
     labels[rows, cols] = near.ids[section]
     image = frame.to_map(np.column_stack([cols, rows]) + 0.5)
-    standing, z = view.ray_meets_plane(image, Plane(*planes_of(near.standing)[section].T), scene.lean, projected_on)
+    standing, z = view.ray_meets_plane(image, Plane(*planes_of(near.standing)[section].T), lean[section], projected_on)
     heights[rows, cols] = z - terrain(standing)
     return labels, heights
 
 
-def _walls(outlines: NDArray[np.object_], lean: tuple[float, float], terrain: Surface) -> NDArray[np.float64]:
+def _walls(
+    outlines: NDArray[np.object_], lean: NDArray[np.float64], terrain: Surface
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Walls (n, 4, 3) from the edges of roofs (PolygonZ, map metres, shells counter-clockwise) to the terrain, where they
-    face the satellite.
+    face the satellite, which sees each roof with its `lean` (m, 2); and the roof (n,) of each.
 
     Walls below ridges are made too: no ray reaches them but through a roof, which is higher. Walls that face away never
     show, for the same reason.
     """
-    points, ring = shapely.get_coordinates(shapely.get_rings(outlines), include_z=True, return_index=True)
+    rings, owner = shapely.get_rings(outlines, return_index=True)
+    points, ring = shapely.get_coordinates(rings, include_z=True, return_index=True)
     first = np.flatnonzero(ring[:-1] == ring[1:])
     start, end = points[first], points[first + 1]
+    roof = owner[ring[first]]
     along = end[:, :2] - start[:, :2]
     foot_start, foot_end = (np.column_stack([p[:, :2], terrain(p[:, :2])]) for p in (start, end))
-    faces = along[:, 1] * lean[0] - along[:, 0] * lean[1] > 1e-9
+    faces = along[:, 1] * lean[roof, 0] - along[:, 0] * lean[roof, 1] > 1e-9
     stands = (start[:, 2] > foot_start[:, 2]) & (end[:, 2] > foot_end[:, 2])
-    return np.stack([start, end, foot_end, foot_start], axis=1)[faces & stands]
+    shown = faces & stands
+    return np.stack([start, end, foot_end, foot_start], axis=1)[shown], roof[shown]
 
 
 def main(argv: list[str] | None = None) -> None:

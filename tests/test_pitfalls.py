@@ -246,6 +246,21 @@ def test_party_walls_are_told_in_the_cityjson():
     assert not any(k["exterior"] for k in kinds if k.get("party_wall"))
 
 
+def test_party_walls_are_those_that_are_published():
+    """A roof that dives at its far end shares its wall as far as it stands; one without a solid leaves its neighbour's free."""
+    polygons = [shapely.box(0, 0, 10, 8), shapely.box(0, -8, 10, 0)]
+    party = {}
+    for slope in (-0.7, -1.3):
+        planes = np.array([[slope, 0, 6.0], [0, 0, 9.5]])
+        sections = solids.Sections(np.arange(1, 3), polygons, planes, ["ok"] * 2, np.full(2, 0.3), (0, 0))
+        party[slope] = [built.solid.party for built in solids.together(sections, np.array([1, 2]), FLAT)]
+    (((start, end),), neighbours) = party[-0.7]
+    assert (start, end[1]) == ((0, 0), 0)
+    assert end[0] == pytest.approx(7857, abs=10)  # 0.5 m above the ground
+    assert neighbours == {((10_000, 0), (0, 0))}
+    assert party[-1.3] == [frozenset(), frozenset()]
+
+
 def test_what_cannot_be_tiled_together_is_made_alone(monkeypatch):
     whole = solids.partition
 

@@ -13,7 +13,7 @@ from affine import Affine
 from rasterio.enums import ColorInterp
 from rasters import build
 
-from kibs_steps import imagery, scene
+from kibs_steps import dtm, imagery, scene
 from kibs_steps.grid import Grid
 
 GRID = Grid("EPSG:32631", rasters.X0, rasters.Y0, 0.38, 110, 90)
@@ -55,6 +55,26 @@ class TestModelGrid:
         assert right - 0.76 < max(x) <= right
         assert bottom <= min(y) < bottom + 0.76
         assert top - 0.76 < max(y) <= top
+
+    @pytest.mark.parametrize(
+        ("crs", "x", "y", "turned"),
+        [("EPSG:27572", 505_000, 2_524_000, -0.959), ("EPSG:27572", 900_000, 2_000_000, 2.770)],
+    )
+    def test_grids_that_count_from_paris_are_kept_and_turned_right(self, tmp_path, crs, x, y, turned):
+        place = Affine(0.38, 0, x, 0, -0.38, y)
+        grid = scene.model_grid(rasters.write(tmp_path / "a.tif", rasters.picture(), crs, transform=place), 0.38)
+        assert (grid.crs, grid.gsd) == (crs, 0.38)
+        to_map = pyproj.Transformer.from_crs(4326, crs, always_xy=True)
+        longitude, latitude = to_map.transform(x, y, direction="INVERSE")
+        east, north = to_map.transform([longitude] * 2, [latitude - 1e-4, latitude + 1e-4])
+        by = np.degrees(np.arctan2(east[1] - east[0], north[1] - north[0]))  # true north, clockwise from the grid's
+        assert scene.convergence(grid) == pytest.approx(-by, abs=1e-3)
+        assert scene.convergence(grid) == pytest.approx(turned, abs=0.01)
+
+    def test_grads_from_paris_are_not_taken_for_degrees(self, tmp_path):
+        place = Affine(5e-6, 0, (1.64 - 2.337229) / 0.9, 0, -3.8e-6, 49.72 / 0.9)
+        path = rasters.write(tmp_path / "a.tif", rasters.picture(), "EPSG:4807", transform=place)
+        assert scene.model_grid(path, 0.38).crs == "EPSG:32631"
 
     def test_feet_are_not_taken_for_metres(self, tmp_path):
         path = rasters.write(
@@ -384,6 +404,33 @@ class TestScene:
             scene.build("toy", path, str(ground), 0.3, tmp_path / out, view=(10, 60))
         for name in ("scene.json", "dtm.tif"):
             assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+    def test_terrain_reaches_to_where_things_stand(self, tmp_path):
+        """Projected on sea level, 800 m below the ground, everything stands 480 m from where it is seen."""
+        x0, y0, step, n = rasters.X0 - 1500.0, rasters.Y0 + 1500.0, 5.0, 600
+        row, col = np.mgrid[:n, :n]
+
+        def height(x_y):
+            return 800.0 + 0.08 * (x_y[..., 1] - rasters.Y0)
+
+        centres = np.stack([x0 + (col + 0.5) * step, y0 - (row + 0.5) * step], axis=-1)
+        ground = rasters.dtm(tmp_path / "t.tif", height(centres).astype("float32"), x0, y0, step)
+        path = rasters.write(tmp_path / "a.tif", rasters.picture())
+        made, content = build(tmp_path, path, str(ground), view=(0.0, 60.0), projection_height=0.0)
+        seen = np.array([rasters.X0 + 20.0, rasters.Y0 - 15.0])
+        stands = seen
+        for _ in range(100):
+            stands = seen + height(stands) * np.array(made.lean)
+        assert np.hypot(*(stands - seen)) > 450
+        assert made.displaced >= np.hypot(*(stands - seen))
+        assert made.terrain(made.grid.bounds)(stands[None])[0] == pytest.approx(height(stands), abs=0.01)
+        assert content["dtm"]["filled"] == 0.0
+        short = rasters.dtm(
+            tmp_path / "s.tif", np.full((90, 90), 800, "float32"), rasters.X0 - 200, rasters.Y0 + 200, step
+        )
+        with pytest.raises(dtm.DtmPartial, match="uncovered"):
+            build(tmp_path, path, str(short), view=(0.0, 60.0), projection_height=0.0)
+        assert build(tmp_path, path, str(short), view=(0.0, 60.0))[0].displaced == 0.0
 
     @pytest.mark.parametrize("crs", ["EPSG:4326", "hello", "EPSG:999999"])
     def test_a_vertical_crs_must_be_vertical(self, tmp_path, crs):

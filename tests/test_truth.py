@@ -11,7 +11,7 @@ from affine import Affine
 
 from kibs_steps import raster, store, truth, view
 from kibs_steps.grid import Grid, Window
-from kibs_steps.scene import Direction
+from kibs_steps.scene import Direction, Region
 from kibs_steps.simulate import scene as simulation
 
 
@@ -115,6 +115,29 @@ def test_own_section_ids_are_kept(tmp_path):
     rows = read(path, scene)[0]
     assert rows["truth_id"].to_pylist() == [40, 30, 20, 10]
     assert rows["visible"].to_pylist() == [1.0, 0.5, 0.25, 0.0]
+
+
+def test_columns_that_mean_something_else_are_no_numbers(tmp_path):
+    scene = toy.make_scene(tmp_path / "scene")
+    roofs = [outline for _, _, outline in toy.roofs()]
+    n = len(roofs)
+    texts = {name: ["yes"] * n for name in ("building", "visible")} | {"section_id": [f"a{k}" for k in range(n)]}
+    rows, *_ = read(write_layer(tmp_path / "t.gpkg", roofs, split=np.resize([0, 1, 2, 3, -1], n), **texts), scene)
+    assert rows["truth_id"].to_pylist() == list(range(1, n + 1))
+    assert rows["building"].null_count == rows["visible"].null_count == n
+    assert rows["split"].to_pylist() == np.resize([0, 1, 2, 2, 2], n).tolist()
+
+
+def test_a_region_is_seen_as_a_view_is(tmp_path):
+    """One view told as a region over all of the raster: the same pixels show the same roofs."""
+    scene = toy.make_scene(tmp_path / "scene")
+    around = Region(shapely.box(*scene.grid.bounds).buffer(100), scene.view)
+    found = []
+    for seen in (scene, scene._replace(view=None, regions=(around,))):
+        found.append(truth.visible_labels(toy_truth(tmp_path, seen), seen, whole(seen)))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
+    assert len(np.unique(found[0][0])) > 3
 
 
 def test_what_is_wrong_with_a_layer_is_said(tmp_path):

@@ -27,8 +27,12 @@ rule evaluation:
     params:
         signature=signature("evaluate"),
         fallback=lambda w: plan(w).models["corners"].contract["heights"]["fallback"],
+        # A surface model gives points to fit planes to, no corners.
+        corners=lambda w, input: (
+            [] if plan(w).settings.get("dsm") else ["--corners", *input.corners]
+        ),
     shell:
         "python -m kibs_steps.evaluate --scene {input.scene:q} --truth {input.truth:q} --labels {input.labels:q}"
-        " --heights {input.heights:q} --sections {input.sections:q} --corners {input.corners:q}"
+        " --heights {input.heights:q} --sections {input.sections:q} {params.corners:q}"
         " --fallback-height {params.fallback}"
         " --out {output.evaluation:q} --picture {output.picture:q} > {log:q} 2>&1"
