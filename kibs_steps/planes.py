@@ -105,8 +105,8 @@ def file_corners(
     """Which corners belong to which section: arrays (section index, corner index), sorted.
 
     A corner goes to the sections whose rim is nearest: within `reach` px, and within `shared` px of the nearest one, so
-    neighbours on a ridge both get it and a section further off does not (0 gives it to the nearest alone). `corners` (n, 2)
-    px. Corners with an owner go to the section of that owner alone.
+    neighbours on a ridge both get it and a section further off does not (0 gives it to the nearest alone, which several are
+    that meet in one rim). `corners` (n, 2) px. Corners with an owner go to the section of that owner alone.
     """
     if not len(outlines) or not len(corners):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
