@@ -1,7 +1,7 @@
 """Recipe: what `snakemake train` does, from the config key `train` to the options of its programs; needs no torch.
 
 `own` names scenes of the same configuration that have a raster, terrain and truth, or gives such data itself (keys as of a
-scene, and `buildings`, `annotated`); `scene` names the scene a model is fine-tuned for: tiles are simulated at its angles (also
+scene, and `buildings`, `annotated`), perhaps for a part those of a `scene`; `scene` names the scene a model is fine-tuned for: tiles are simulated at its angles (also
 those that `metadata` tell).
 """
 
@@ -77,8 +77,11 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
 
     own: dict[str, dict[str, Any]] = {}
     for i, item in enumerate(train["own"]):
-        given = settings_of(item, "own") if isinstance(item, str) else seen({**common, **item})
-        name = item if isinstance(item, str) else str(item.get("name", f"own{i}"))
+        item = {"scene": item} if isinstance(item, str) else item
+        given = {**settings_of(item["scene"], "own"), **item} if "scene" in item else seen({**common, **item})
+        name = str(item.get("name", item.get("scene", f"own{i}")))
+        if "buildings" in item and "truth" not in item:
+            given.pop("truth", None)
         chosen = {k: given[k] for k in OWN if given.get(k) is not None}
         if given.get("regions"):
             raise BadConfig(

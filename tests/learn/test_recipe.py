@@ -89,6 +89,17 @@ def test_fine_tuning_takes_the_scenes_angles_and_the_sets_weights(tmp_path):
     assert recipe.weights(str(folder / "weights.pt"), "both", tmp_path) == folder / "weights.pt"
 
 
+def test_own_data_of_a_scene_may_be_given_in_part(tmp_path):
+    train = {
+        "own": [{"scene": "town", "annotated": "a.gpkg"}, {"scene": "town", "name": "outlines", "buildings": "b.gpkg"}]
+    }
+    found = recipe.recipe({"scenes": {"town": TOWN}, "train": train}, tmp_path).own
+    assert found["town"]["annotated"] == "a.gpkg"
+    assert (found["town"]["truth"], found["town"]["view_azimuth"]) == ("t.gpkg", 181.1)
+    assert (found["outlines"]["raster"], found["outlines"]["buildings"]) == ("t.tif", "b.gpkg")
+    assert "truth" not in found["outlines"]
+
+
 def test_angles_may_come_from_metadata(tmp_path):
     item = tmp_path / "item.json"
     item.write_text(json.dumps({"type": "Feature", "properties": {"view:azimuth": 20.0, "view:incidence_angle": 20.0}}))
