@@ -1,8 +1,8 @@
 """Recipe: what `snakemake train` does, from the config key `train` to the options of its programs; needs no torch.
 
 `own` names scenes of the same configuration that have a raster, terrain and truth, or gives such data itself (keys as of a
-scene, and `buildings`, `annotated`), perhaps for a part those of a `scene`; `scene` names the scene a model is fine-tuned for: tiles are simulated at its angles (also
-those that `metadata` tell).
+scene, and `buildings`, `annotated`; with `scene` only what differs from that one's); `scene` names the scene a model is
+fine-tuned for: tiles are simulated at its angles (also those that `metadata` tell).
 """
 
 from __future__ import annotations
