@@ -28,7 +28,7 @@ from kibs_steps.stitch import SECTIONS, distinct_corners, owner_blocks, section_
 LAYER = "roof_sections_image"
 UNREADABLE = "sections {path} cannot be read ({error}): give the edited city.gpkg or a GeoPackage"
 EMPTY_LAYER = f"sections {{path}} holds no polygons: give the layer {LAYER} as edited"
-SAME = 1e-4  # px: an outline that moved less was not touched
+SAME = 0.01  # px: an outline that moved less was not touched, but perhaps saved in another CRS
 
 
 class SectionsUnusable(KibsError):
@@ -72,7 +72,8 @@ def _polygon(outline: shapely.Geometry) -> shapely.Geometry | None:
     """A valid polygon of an outline drawn by hand: the largest part where it crosses itself."""
     if outline.is_valid:
         return outline if outline.area > 0 else None
-    parts = [p for p in shapely.get_parts(shapely.make_valid(outline)) if p.geom_type == "Polygon"]
+    mended = shapely.make_valid(outline, method="structure", keep_collapsed=False)
+    parts = [p for p in shapely.get_parts(mended) if p.geom_type == "Polygon" and p.area > 0]
     return max(parts, key=shapely.area, default=None)
 
 
@@ -98,6 +99,12 @@ def named(ids: np.ndarray, outlines: np.ndarray, known: set[int], grid: Grid) ->
     return given
 
 
+def same(one: shapely.Geometry, other: shapely.Geometry) -> bool:
+    """Whether two outlines have the same vertices, wherever their rings begin."""
+    counts = [shapely.get_num_coordinates(shapely.get_rings(outline)).tolist() for outline in (one, other)]
+    return sorted(counts[0]) == sorted(counts[1]) and bool(shapely.hausdorff_distance(one, other) < SAME)
+
+
 def edited(
     ids: np.ndarray, outlines: np.ndarray, before: pa.Table, corners: pa.Table, grid: Grid
 ) -> tuple[pa.Table, pa.Table]:
@@ -112,10 +119,7 @@ def edited(
     ids, outlines = ids[order], shapely.orient_polygons(outlines[order])
     rows = [row_of.get(int(k)) for k in ids]
     touched = np.array(
-        [
-            r is None or not shapely.equals_exact(old[r].normalize(), o.normalize(), SAME)
-            for r, o in zip(rows, outlines, strict=True)
-        ],
+        [r is None or not same(old[r], o) for r, o in zip(rows, outlines, strict=True)],
         bool,
     )
     edge = touches_edge(outlines, grid)

@@ -111,7 +111,7 @@ def _sound(shapes: NDArray[np.object_], called: str) -> tuple[NDArray[np.object_
         rows = ", ".join(map(str, np.unique(source[crossed])[:5] + 1))
         print(f"warning: {called}: {crossed.sum()} outlines cross themselves (rows {rows}): repaired", file=sys.stderr)
         parts = parts.copy()
-        parts[crossed] = shapely.make_valid(parts[crossed])
+        parts[crossed] = shapely.make_valid(parts[crossed], method="structure", keep_collapsed=False)
     deeper, inner = shapely.get_parts(parts, return_index=True)
     keep = (shapely.get_type_id(deeper) == shapely.GeometryType.POLYGON) & (shapely.area(deeper) > 0)
     return deeper[keep], source[inner][keep]

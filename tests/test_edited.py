@@ -107,6 +107,9 @@ def test_moved_split_deleted_and_drawn(tmp_path, world):
 def test_a_layer_in_degrees_is_brought_back(tmp_path, world):
     sections, _ = run(tmp_path, world, world[3], "EPSG:4326")
     assert set(sections["section_id"].to_pylist()) == set(world[3]["section_id"])
+    before = {r["section_id"]: r for r in world[1].to_pylist()}
+    for row in sections.to_pylist():  # to the bit: nothing was touched
+        assert {name: row[name] for name in before[row["section_id"]]} == before[row["section_id"]]
     area = shapely.area(shapely.from_wkb(sections["outline"].to_pylist()))
     np.testing.assert_allclose(area, 400.0, rtol=1e-3)
 
@@ -125,4 +128,7 @@ def test_a_bowtie_becomes_its_larger_part(world):
     grid = world[0].grid
     assert edited._polygon(shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])).is_valid
     assert edited._polygon(shapely.Polygon([(0, 0), (1, 1), (2, 2)])) is None
+    spiked = edited._polygon(shapely.Polygon([(0, 0), (10, 10), (10, 0), (12, 0), (10, 0), (0, 10)]))
+    assert spiked.is_valid
+    assert spiked.area == pytest.approx(25.0)
     assert grid.width == toy_city.WIDTH

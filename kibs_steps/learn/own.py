@@ -13,6 +13,7 @@ easier than a new place. `blocks` draws squares of tiles instead and leaves out 
 from __future__ import annotations
 
 import argparse
+import shutil
 from pathlib import Path
 from typing import NamedTuple
 
@@ -232,6 +233,8 @@ def main(argv: list[str] | None = None) -> None:
         sections = truth.read(args.out / "scene/truth.parquet", scene)
     else:
         buildings = outlines_on(scene, args.buildings)
+    for name in SPLITS:  # tiles of an earlier cut would be of another set now
+        shutil.rmtree(args.out / name, ignore_errors=True)
     heights = []
     for place, own in zip(found, code.tolist(), strict=True):
         if own == LEFT_OUT:

@@ -92,6 +92,8 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
                 raise BadConfig(f"train.own: {name} has no {key}")
         if ("truth" in chosen) == ("buildings" in chosen):
             raise BadConfig(f"train.own: {name} needs either truth (roof sections) or buildings (outlines)")
+        if name in own:
+            raise BadConfig(f"train.own: two data sets are called {name}: give one another name")
         own[name] = chosen
     if not own and not train["data"] and not train["tiles"]:
         raise BadConfig("train: nothing to learn from: give own, data or tiles")

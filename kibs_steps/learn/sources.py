@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from kibs_steps import photographs, store
+from kibs_steps import fingerprint, photographs, store
 from kibs_steps.learn import augmentation, dataset
 from kibs_steps.learn.samples import Sample
 from kibs_steps.simulate import citymodel, draped
@@ -110,6 +110,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     view = _direction(args.view_azimuth, args.view_elevation)
     sun = _direction(args.sun_azimuth, args.sun_elevation)
     if args.tiles:
+        _claim(pool, args, view, sun)
         cities = tuple(map(citymodel.read, args.cities))
         houses = draped.houses(training, draped.read_heights(roof_graphs)) if training else []
         look = (args.tiles, args.seed, chips, view, sun, cities, houses, args.gsd)
@@ -131,6 +132,15 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     validation = [prepared(sample, size, upright) for sample in validation]
     simulates = bool(args.tiles) or any(pool.glob("[!.]*.npz"))
     return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
+
+
+def signature(args: argparse.Namespace) -> str:
+    """What a run learns from and starts from, as a hash: with other data it is another run."""
+    records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
+    view, sun = _direction(args.view_azimuth, args.view_elevation), _direction(args.sun_azimuth, args.sun_elevation)
+    init = fingerprint.of_source(args.init, Path(args.out) / "fingerprints.json") if args.init else None
+    cities = sorted(Path(city).name for city in args.cities)
+    return fingerprint.of_values(records, bool(args.data), args.free, sorted(args.leave_out), cities, view, sun, init)
 
 
 def prepared(sample: Sample, size: int, upright: bool) -> Sample:
@@ -222,6 +232,27 @@ def fill_pool(
                 tall=number % TALL_EVERY == TALL_EVERY - 1,
             )
             sample.save(path)
+
+
+def _claim(pool: Path, args: argparse.Namespace, view: Any, sun: Any) -> None:
+    """Say in a pool what its tiles show. Raises `NoTrainingData` where those that are there show something else."""
+    shown = {
+        "seed": args.seed,
+        "gsd": args.gsd,
+        "view": view and list(view),
+        "sun": sun and list(sun),
+        "cities": sorted(Path(city).name for city in args.cities),
+        "photographs": bool(args.data),
+        "free": bool(args.free),
+    }
+    record = pool / "pool.json"
+    if record.is_file() and store.read_json(record) != shown:
+        raise photographs.NoTrainingData(
+            f"{pool} holds tiles of other settings ({store.read_json(record)}, not {shown}): delete it, or choose another --pool "
+            "(train.name)"
+        )
+    pool.mkdir(parents=True, exist_ok=True)
+    store.write_json(record, shown, summed=False)
 
 
 def _wait_for_first(pool: Path, seconds: float = 600.0) -> None:

@@ -169,12 +169,13 @@ def train(
     patience: int = 10,
     look_every: int = 500,
     about: dict[str, Any] | None = None,
+    sources: str = "",
 ) -> int:
     """Train until `seconds` of work (or `steps` in all) are used, counting what earlier calls on `out` used; returns steps.
 
     With `validation` examples their loss is looked at every `look_every` steps, and the run ends after `patience` looks
-    without a lower one. `about` (data, licence, angles) is kept in the checkpoint for the contract. Raises `ContractMismatch`
-    if `out` holds another run.
+    without a lower one. `about` (data, licence, angles) is kept in the checkpoint for the contract, `sources` tells what is
+    learned from (`sources.signature`). Raises `ContractMismatch` if `out` holds another run.
     """
     from torch.utils.tensorboard import SummaryWriter
 
@@ -192,6 +193,10 @@ def train(
         state = torch.load(path, weights_only=True, map_location=where)
         if Settings(**state["settings"]) != settings:
             raise ContractMismatch(f"{path} is another run ({state['settings']}): choose another --out, or delete it")
+        if sources and state.get("sources", sources) != sources:
+            raise ContractMismatch(
+                f"{path} learned from other data, or started from other weights: choose another --out (train.name), or delete it"
+            )
         model.load_state_dict(state["model"])
         optimiser.load_state_dict(state["optimiser"])
         average = state["average"]
@@ -208,6 +213,7 @@ def train(
     )
     parts = [validation[i : i + settings.batch] for i in range(0, len(validation), settings.batch)]
     judged = [moved(collate(list(part)), where) for part in parts]
+    best = best if judged else Best(math.inf, 0, 0, {})
     writer = SummaryWriter(str(out / "log"))
 
     def keep() -> None:
@@ -220,6 +226,7 @@ def train(
             "seconds": used,
             "best": best._asdict(),
             "about": about or {},
+            "sources": sources,
             "converged": best.since >= patience if judged else None,
         }
         with store.whole(path, summed=False) as temporary:
@@ -327,6 +334,7 @@ def main(argv: list[str] | None = None) -> None:
         validation=kept,
         patience=args.patience,
         about=found.about,
+        sources=sources.signature(args),
     )
     store.write_json(out / "done.json", {"settings": settings._asdict(), "steps": steps, **found.about}, summed=False)
     print(f"{out / 'checkpoint.pt'}: {steps} steps")

@@ -23,6 +23,7 @@ from kibs_steps.zbuffer import Polygon, planes
 UPRIGHT = 0.05  # vertical part of a unit normal below which a surface is a wall
 ONE_PLANE = 0.05  # m: corners this near to a neighbour's plane lie in it
 BENT = 0.2  # m: a surface with corners this far off its plane is cut into triangles
+ARCHED = 0.25  # m from their common plane, beyond which faces that are one in pairs are a vault
 STRAIGHT = 0.01  # m: a corner this near to the line through its neighbours is none
 
 
@@ -86,19 +87,24 @@ def read(path: str | Path) -> CityModel:
 
 def _horizontal(system: str | None) -> str | None:
     """The horizontal part of a reference system, "EPSG:n"; None where none is stated. Raises `UnusableCity` for degrees."""
-    code = re.search(r"(\d+)$", system or "")
-    if not code:
+    # The URL or URN of one system, or of several: then the horizontal one comes first.
+    codes = re.findall(r"EPSG(?::[^:,]*:|/[^/]*/|:)(\d+)", system or "", re.IGNORECASE) or re.findall(
+        r"(\d+)/?$", system or ""
+    )
+    if not codes:
         return None
     import pyproj
 
     try:
-        crs = pyproj.CRS.from_epsg(int(code[1]))
+        crs = pyproj.CRS.from_epsg(int(codes[0]))
     except pyproj.exceptions.CRSError as error:
         raise UnusableCity(f"the city's reference system {system} is not known: state one of EPSG's") from error
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
     if flat.is_geographic:
         raise UnusableCity(f"the city's coordinates are degrees ({system}): reproject it to a system in metres")
-    return f"EPSG:{flat.to_epsg() or code[1]}"
+    if not flat.is_projected or any(axis.unit_conversion_factor != 1.0 for axis in flat.axis_info):
+        raise UnusableCity(f"the city's coordinates are not metres ({system}): reproject it to a system in metres")
+    return f"EPSG:{flat.to_epsg() or codes[0]}"
 
 
 def _vertices(stored: list, transform: dict[str, Any] | None) -> np.ndarray:
@@ -137,15 +143,16 @@ def _lod(geometry: dict[str, Any]) -> float:
 
 def _buildings(objects: dict[str, Any], corners: np.ndarray) -> list[Building]:
     """The buildings among city objects, parts gathered under their top-level object, in the file's order."""
-    above = {c: name for name, o in objects.items() for c in [*o.get("children", ()), *o.get("Parts", ())]}
-    for name, item in objects.items():
-        parent = item.get("parent") or next(iter(item.get("parents", ())), None)
+    whole = {name: o for name, o in objects.items() if o["type"].startswith("Building")}  # groups of buildings are none
+    above = {c: name for name, o in whole.items() for c in [*o.get("children", ()), *o.get("Parts", ())]}
+    for name, item in whole.items():
+        parent = item.get("parent") or next((p for p in item.get("parents", ()) if p in whole), None)
         if parent:
             above[name] = parent
     shells: dict[str, list[tuple[Polygon, str | None]]] = {}
     for name, item in objects.items():
-        chosen = max(item.get("geometry") or [], key=_lod, default=None)
-        if not item["type"].startswith("Building") or chosen is None or not 2 <= _lod(chosen) < 3:
+        chosen = max((g for g in item.get("geometry") or [] if 2 <= _lod(g) < 3), key=_lod, default=None)
+        if not item["type"].startswith("Building") or chosen is None:
             continue
         top = name
         while top in above:
@@ -203,7 +210,8 @@ def sections(roofs: list[Polygon]) -> list[Polygon]:
         for i, j in shapely.STRtree(shapes).query(shapes, predicate="intersects").T.tolist():
             if i < j and group[i] != group[j] and _one_plane(roofs, plane.normal, i, j):
                 shared = shapely.intersection(shapes[i].boundary, shapes[j].boundary)
-                if shared.length > 0.1:
+                both = [roofs[k] for k, g in enumerate(group) if g in (group[i], group[j])]
+                if shared.length > 0.1 and _flat_together(both):
                     old = group[j]
                     group = [group[i] if g == old else g for g in group]
         merged = []
@@ -217,6 +225,14 @@ def sections(roofs: list[Polygon]) -> list[Polygon]:
         roofs = merged
     straight = (Polygon(_straight(f.ring), tuple(_straight(h) for h in f.holes)) for f in roofs)
     return [f for f in straight if len(f.ring) >= 3]
+
+
+def _flat_together(faces: list[Polygon]) -> bool:
+    """Whether all corners of faces lie near one plane: facets of a vault do in pairs, and not together."""
+    points = np.concatenate([face.ring for face in faces])
+    points = points - points.mean(axis=0)
+    normal = np.linalg.svd(points, full_matrices=False)[2][-1]
+    return bool(np.abs(points @ normal).max() < ARCHED)
 
 
 def _flattened(face: Polygon) -> list[Polygon]:

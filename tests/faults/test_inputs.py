@@ -63,7 +63,8 @@ def test_the_page_tells_all_cases():
 def test_a_truth_that_crosses_itself_is_repaired(tmp_path, capsys):
     """A bow tie becomes its two triangles, each with heights."""
     left, bottom, right, top = cases.BOX
-    tie = shapely.Polygon([(left, bottom, 58), (right, top, 58), (right, bottom, 58), (left, top, 58)])
+    spike = [(right, bottom, 58), (right + 2, bottom, 58), (right, bottom, 58)]  # and back again
+    tie = shapely.Polygon([(left, bottom, 58), (right, top, 58), *spike, (left, top, 58)])
     path = cases.vector(tmp_path / "t.gpkg", [tie, cases.roof()])
     layer = truth.read_layer(path, "map")
     assert len(layer.polygons) == 3

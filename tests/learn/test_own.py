@@ -86,6 +86,14 @@ def test_samples_are_what_the_renderer_shows(city, tmp_path, frame):
     assert {k: v[0] for k, v in again.items()} == {k: v[0] for k, v in samples.items()}
 
 
+def test_another_split_leaves_no_tile_of_the_one_before(city, tmp_path):
+    folder, _ = city
+    for options in (["--split=shuffle"], ["--split=shuffle", "--seed=7"]):
+        prepare(city, tmp_path / "own", *options, f"--truth={folder}/truth.gpkg")
+        tiles = [path.name for path in (tmp_path / "own").glob("*/r*.npz")]
+        assert len(tiles) == len(set(tiles)) == 9
+
+
 def test_the_truth_comes_back_with_its_split(city, tmp_path):
     folder, _ = city
     prepare(city, tmp_path / "own", "--split=shuffle", f"--truth={folder}/truth.gpkg")

@@ -55,6 +55,14 @@ def test_another_run_is_not_overwritten(tmp_path):
         training.train(training.network(), tiles, SETTINGS._replace(seed=1), tmp_path, 600, steps=2, workers=0)
 
 
+def test_a_run_on_other_data_is_another_run(tmp_path):
+    tiles = Tiles()
+    training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=1, workers=0, sources="one")
+    with pytest.raises(ContractMismatch, match="other data"):
+        training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=2, workers=0, sources="other")
+    assert training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=2, workers=0, sources="one") == 2
+
+
 def logits() -> dict[str, torch.Tensor]:
     """Blank logits of a 64 px tile, by name, that ask for gradients."""
     sides = {

@@ -1,6 +1,7 @@
 """What a run learns from, and what its contract then says."""
 
 import argparse
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ def arguments(*words):
     parser = argparse.ArgumentParser()
     parser.add_argument("--out", default="runs/x/both")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--init")
     sources.add_arguments(parser)
     return parser.parse_args(list(words))
 
@@ -60,6 +62,33 @@ def test_a_third_of_the_tiles_keeps_its_look(tmp_path):
     looks = [np.unique(mixture[i].rgb) for i in range(80)]
     kept = sum(len(look) == 1 and look[0] in (0, 10, 20, 30) for look in looks)
     assert 20 <= kept <= 44
+
+
+def test_a_pool_of_other_settings_is_refused(tmp_path):
+    def claimed(*words):
+        args = arguments(f"--pool={tmp_path / 'pool'}", *words)
+        view = sources._direction(args.view_azimuth, args.view_elevation)
+        sources._claim(Path(args.pool), args, view, None)
+
+    claimed("--view-azimuth=140", "--view-elevation=50")
+    claimed("--view-azimuth=500", "--view-elevation=50")  # the same direction
+    with pytest.raises(photographs.NoTrainingData, match=r"pool holds tiles of other settings .* delete it"):
+        claimed("--view-azimuth=320", "--view-elevation=65")
+    with pytest.raises(photographs.NoTrainingData):
+        claimed("--view-azimuth=140", "--view-elevation=50", "--gsd=0.25")
+
+
+def test_data_and_weights_make_a_run(tmp_path):
+    def signature(*words):
+        return sources.signature(arguments("--tiles=5", f"--out={tmp_path / 'run'}", *words))
+
+    (tmp_path / "w.pt").write_bytes(b"weights")
+    town = own(tmp_path / "town")
+    plain = signature()
+    assert plain == signature("--shares=simulated=1")  # how often, not what
+    kinds = [plain, signature("--free"), signature(f"--init={tmp_path / 'w.pt'}"), signature("--own", str(town))]
+    own(tmp_path / "town", count=11)
+    assert len({*kinds, signature("--own", str(town))}) == 5
 
 
 def test_corner_heights_of_several_data_sets_are_pooled(tmp_path):

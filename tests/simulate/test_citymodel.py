@@ -57,6 +57,70 @@ def test_the_highest_detail_counts(tmp_path):
     assert len(citymodel.read(tmp_path / "c.json").buildings[0].roofs) == 2
 
 
+def test_a_building_that_has_lod3_too_is_shown_by_its_lod2(tmp_path):
+    document = cities.document([HOUSE], shift=SHIFT)
+    part = document["CityObjects"]["b0-0"]
+    part["geometry"].append({**part["geometry"][0], "lod": "3"})
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    assert len(citymodel.read(tmp_path / "c.json").buildings[0].roofs) == 2
+
+
+def test_a_group_of_buildings_is_no_building(tmp_path):
+    document = cities.document([HOUSE, cities.gable(84040.0, 446020.0, 5.5)], shift=SHIFT)
+    tops = [name for name, item in document["CityObjects"].items() if item["type"] == "Building"]
+    document["CityObjects"]["street"] = {"type": "CityObjectGroup", "children": tops, "geometry": []}
+    for name in tops:
+        document["CityObjects"][name]["parents"] = ["street"]
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    assert [b.name for b in citymodel.read(tmp_path / "c.json").buildings] == tops
+
+
+@pytest.mark.parametrize(
+    ("system", "crs"),
+    [
+        ("https://www.opengis.net/def/crs/EPSG/0/7415", "EPSG:28992"),
+        ("https://www.opengis.net/def/crs/EPSG/0/28992/", "EPSG:28992"),
+        ("urn:ogc:def:crs:EPSG::25832", "EPSG:25832"),
+        ("urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::7837", "EPSG:25832"),
+        (
+            "https://www.opengis.net/def/crs-compound?1=https://www.opengis.net/def/crs/EPSG/0/28992&"
+            "2=https://www.opengis.net/def/crs/EPSG/0/5709",
+            "EPSG:28992",
+        ),
+        (None, None),
+    ],
+)
+def test_the_horizontal_system_is_read(tmp_path, system, crs):
+    document = cities.document([HOUSE], shift=SHIFT)
+    document["metadata"] = {"referenceSystem": system} if system else {}
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    assert citymodel.read(tmp_path / "c.json").crs == crs
+
+
+@pytest.mark.parametrize("number", [2263, 5709])
+def test_coordinates_that_are_not_metres_in_plan_are_refused(tmp_path, number):
+    document = cities.document([HOUSE], shift=SHIFT)
+    document["metadata"] = {"referenceSystem": f"https://www.opengis.net/def/crs/EPSG/0/{number}"}
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    with pytest.raises(UnusableCity, match="not metres"):
+        citymodel.read(tmp_path / "c.json")
+
+
+def test_facets_of_a_vault_are_no_one_plane():
+    angle = np.radians(np.arange(60.0, 121.0, 1.5))
+    x, z = -16.0 * np.cos(angle), 16.0 * np.sin(angle)
+    facets = [
+        Polygon(np.array([[a, 0, p], [b, 0, q], [b, 10, q], [a, 10, p]]))
+        for a, b, p, q in zip(x, x[1:], z, z[1:], strict=False)
+    ]
+    found = citymodel.sections(facets)
+    assert 2 <= len(found) < len(facets)
+    for face in found:
+        points = face.ring - face.ring.mean(axis=0)
+        assert np.abs(points @ np.linalg.svd(points)[2][-1]).max() < citymodel.ARCHED
+    assert sum(shapely.Polygon(face.ring[:, :2]).area for face in found) == pytest.approx(160.0, abs=0.1)
+
+
 def test_neighbours_in_one_plane_are_one_section():
     left = Polygon(np.array([[0, 0, 3], [4, 0, 3], [4, 2, 4.0], [4, 4, 5], [0, 4, 5]], float))
     right = Polygon(np.array([[4, 0, 3], [9, 0, 3], [9, 4, 5], [4, 4, 5], [4, 2, 4]], float))
