@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -20,6 +21,10 @@ def run(main: Callable[[], None], pandas: bool = True) -> None:
         sys.meta_path.insert(0, _NoPandas)
     try:
         main()
+        sys.stdout.flush()
+    except BrokenPipeError:  # who reads along has seen enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
     except Exception as error:
         text = told(error)
         if text is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from collections import namedtuple
 from pathlib import Path
 from types import SimpleNamespace
@@ -91,6 +92,12 @@ def test_the_last_line_is_ours(capsys, error, last, traced):
     assert end.value.code == 1
     assert said.strip().split("\n")[-1].startswith(last)
     assert ("Traceback" in said) == traced
+
+
+def test_a_reader_that_has_seen_enough_is_no_fault(tmp_path):
+    code = "from kibs_steps import cli; cli.run(lambda: print('x\\n' * 1_000_000))"
+    done = subprocess.run(["bash", "-c", f'"{sys.executable}" -c "{code}" | head -1'], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("x\n", "")
 
 
 def test_a_disk_that_is_full(tmp_path, monkeypatch):
