@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.accuracy.methods import Method
 from kibs_steps import metrics, photographs
 from kibs_steps.blend import blend
-from kibs_steps.learn import validation
+from kibs_steps.learn import dataset, validation
 from kibs_steps.learn.samples import Sample
 from kibs_steps.models import contract as contracts
 from kibs_steps.models import heads, runtime
@@ -38,8 +38,10 @@ class Found(NamedTuple):
 
 def sets(data: Path, count: int, per_place: int, gsd: float) -> dict[str, list[Sample]]:
     """The samples of every set at the models' GSD, always the same ones."""
+    photographed = validation.photographed(data, data / "roofgraph" / "roofgraph.tar", count, SIDE, gsd)
     found = {
-        "B photographs": validation.photographed(data, data / "roofgraph" / "roofgraph.tar", count, SIDE, gsd),
+        # As it is known: they were taken from above.
+        "B photographs": [sample._replace(geometry=dataset.NADIR.copy()) for sample in photographed],
         "village": validation.village(data / "village", VILLAGE, gsd),
     }
     places: dict[str, list[photographs.Chip]] = {}
