@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kibs_steps import cli, failures, imagery, inputs, scene, sources
+from kibs_steps import cli, failures, georeference, imagery, inputs, scene, sources
 from kibs_steps import plan as plans
 from kibs_steps.models import runtime
 from kibs_steps.plan import Plan
@@ -111,7 +111,7 @@ def page(plan: Plan, results: Path, todo: Mapping[str, int]) -> str:
         width, height, gsd, crs = side, side, settings["simulate"]["gsd"], settings["simulate"]["crs"]
         image = f"simulated, seed {settings['simulate']['seed']}"
     else:
-        grid = scene.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))
+        grid = georeference.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))
         width, height, gsd, crs = grid.width, grid.height, grid.gsd, grid.crs.splitlines()[0][:40]
         with imagery.opened(plan.raster) as source:
             bands = ",".join(map(str, imagery.colour_bands(source, inputs.bands_of(settings))[0]))

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, scene, store, view
+from kibs_steps import cli, georeference, scene, store, view
 from kibs_steps.planes import map_bounds, middle_of
 
 LEVEL = 3.0  # deg: below this a slope has no direction
@@ -81,7 +81,7 @@ def ground(planes: pa.Table, facts: scene.Scene, dtm: view.Surface) -> pa.Table:
     middle = view.Plane(*column.values()).at(centre) - dtm(centre)
     elevation = np.array([v.elevation if v else np.nan for v in facts.views(middles)], float)
     along, across = view.position_sigma(middle, planes["height_sigma"].to_numpy(), elevation, ANGLE_SIGMA)
-    slope, azimuth = slope_azimuth(column["plane_a"], column["plane_b"], scene.convergence(facts.grid))
+    slope, azimuth = slope_azimuth(column["plane_a"], column["plane_b"], georeference.convergence(facts.grid))
     values = {
         "outline_seen": shapely.to_wkb(outline_seen, output_dimension=3),
         "outline_map": shapely.to_wkb(outline_map, output_dimension=3),

@@ -28,18 +28,18 @@ def check(plan: Plan, results: Path) -> list[str]:
     """Refuse what a scene cannot be made from; returns what is doubtful. Raises the named errors of docs/inputs.md."""
     import pyproj
 
-    from kibs_steps import dtm, imagery, regions, scene
+    from kibs_steps import dtm, georeference, imagery, regions, scene
 
     writable(results / plan.name)
     settings = plan.settings
     if settings.get("simulate") is not None:
         return []
-    grid = scene.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))
+    grid = georeference.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))
     for name, lowest in (("view", 20.0), ("sun", 5.0)):
         scene.direction(settings.get(f"{name}_azimuth"), settings.get(f"{name}_elevation"), grid, name, lowest)
     vertical = settings.get("vertical_crs")
-    scene.check_vertical(vertical)
-    lacking = scene.missing_geoid(grid.crs, vertical)
+    georeference.check_vertical(vertical)
+    lacking = georeference.missing_geoid(grid.crs, vertical)
     doubts = [
         f"PROJ lacks the geoid {lacking}: 3D Tiles take heights of {vertical} from the ellipsoid, up to 100 m off; fetch it "
         f"(pyproj sync --file {lacking}, or PROJ_NETWORK=ON)"

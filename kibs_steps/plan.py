@@ -230,14 +230,14 @@ def models_for(settings: dict[str, Any], base: Path) -> dict[str, contract.Model
 
 def own_gsd(raster: str | None) -> float | None:
     """Pixel side (m) of a file's or URL's raster, None where there is none to read: that is refused later, with what to do."""
-    from kibs_steps import scene
+    from kibs_steps import georeference
 
     path = sources.place(raster or "")
     if sources.is_remote(path):
         sources.version(path)  # says better than GDAL what does not answer
     elif not Path(path).exists():
         return None
-    return scene.own_gsd(path)
+    return georeference.own_gsd(path)
 
 
 def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) -> list[str]:
@@ -264,7 +264,7 @@ def folder_of(models: str, base: Path) -> Path:
 
 def grid_size(raster: str, gsd: float, aoi: str | None) -> tuple[int, int]:
     """Width and height (px) of the model grid over a raster, from its header."""
-    from kibs_steps.scene import model_grid
+    from kibs_steps.georeference import model_grid
 
     grid = model_grid(raster, gsd, aoi)
     return grid.width, grid.height

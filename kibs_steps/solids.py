@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from kibs_steps import cli, clip, features, gate, mesh, scene, shells, store, straight
+from kibs_steps import cli, clip, features, gate, georeference, mesh, scene, shells, store, straight
 from kibs_steps.buildings import hidden
 from kibs_steps.errors import KibsError
 from kibs_steps.faces import MM, Face, NoPartition, Point, dissolved, shapes_of
@@ -435,7 +435,7 @@ def main(argv: list[str] | None = None) -> None:
     facts = scene.read(args.scene)
     grid = facts.grid
     datum = (int(np.floor(grid.bounds[0])), int(np.floor(grid.bounds[1])))
-    convergence = scene.convergence(grid)
+    convergence = georeference.convergence(grid)
     table = store.read_table(args.buildings, block=args.name)
     clusters = list(clusters_of(table))
     shapes = [_moved(p, s.origin) for _, s in clusters for p in s.polygons if p is not None and not p.is_empty]

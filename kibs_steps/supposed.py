@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kibs_steps import cli, scene, store
+from kibs_steps import cli, georeference, scene, store
 from kibs_steps import view as geometry
 from kibs_steps.grid import Grid, Tile, Tiling, Window
 from kibs_steps.scene import Direction, Scene
@@ -157,7 +157,7 @@ def main(argv: list[str] | None = None) -> None:
         return doubt(*(np.concatenate([found[name][0][data] for found, data in maps]) for name in ("roof", "edge")))
 
     known = Supposed(facts.view, facts.sun)
-    found = directions(look, *known, scene.convergence(facts.grid)) if shown else known
+    found = directions(look, *known, georeference.convergence(facts.grid)) if shown else known
     store.write_json(args.out, {name: d and d._asdict() for name, d in found._asdict().items()})
     for name, key, before, direction in (
         ("seen", "view", facts.view, found.view),

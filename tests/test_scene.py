@@ -13,7 +13,7 @@ from affine import Affine
 from rasterio.enums import ColorInterp
 from rasters import build
 
-from kibs_steps import dtm, imagery, scene
+from kibs_steps import dtm, georeference, imagery, scene
 from kibs_steps.grid import Grid
 
 GRID = Grid("EPSG:32631", rasters.X0, rasters.Y0, 0.38, 110, 90)
@@ -22,12 +22,12 @@ GRID = Grid("EPSG:32631", rasters.X0, rasters.Y0, 0.38, 110, 90)
 class TestModelGrid:
     def test_a_raster_of_the_models_gsd_is_used_as_it_is(self, tmp_path):
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), gsd=0.3805)
-        assert scene.model_grid(path, 0.38) == Grid("EPSG:32631", rasters.X0, rasters.Y0, 0.3805, 110, 90)
+        assert georeference.model_grid(path, 0.38) == Grid("EPSG:32631", rasters.X0, rasters.Y0, 0.3805, 110, 90)
 
     @pytest.mark.parametrize("gsd", [0.1, 0.3, 0.5])
     def test_another_gsd_is_resampled_over_the_same_bounds(self, tmp_path, gsd):
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), gsd=gsd)
-        grid = scene.model_grid(path, 0.38)
+        grid = georeference.model_grid(path, 0.38)
         left, bottom, right, top = grid.bounds
         assert (grid.crs, grid.gsd, left, top) == ("EPSG:32631", 0.38, rasters.X0, rasters.Y0)
         assert 0 <= right - (rasters.X0 + 110 * gsd) < 0.38
@@ -46,7 +46,7 @@ class TestModelGrid:
     )
     def test_others_are_covered_by_a_utm_grid(self, tmp_path, crs, transform, zone):
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), crs, transform=transform)
-        grid = scene.model_grid(path, 0.38)
+        grid = georeference.model_grid(path, 0.38)
         assert (grid.crs, grid.gsd) == (zone, 0.38)
         corners = [transform * corner for corner in [(0, 0), (110, 0), (110, 90), (0, 90), (55, 0), (55, 90)]]
         x, y = pyproj.Transformer.from_crs(crs, zone, always_xy=True).transform(*np.transpose(corners))
@@ -62,38 +62,38 @@ class TestModelGrid:
     )
     def test_grids_that_count_from_paris_are_kept_and_turned_right(self, tmp_path, crs, x, y, turned):
         place = Affine(0.38, 0, x, 0, -0.38, y)
-        grid = scene.model_grid(rasters.write(tmp_path / "a.tif", rasters.picture(), crs, transform=place), 0.38)
+        grid = georeference.model_grid(rasters.write(tmp_path / "a.tif", rasters.picture(), crs, transform=place), 0.38)
         assert (grid.crs, grid.gsd) == (crs, 0.38)
         to_map = pyproj.Transformer.from_crs(4326, crs, always_xy=True)
         longitude, latitude = to_map.transform(x, y, direction="INVERSE")
         east, north = to_map.transform([longitude] * 2, [latitude - 1e-4, latitude + 1e-4])
         by = np.degrees(np.arctan2(east[1] - east[0], north[1] - north[0]))  # true north, clockwise from the grid's
-        assert scene.convergence(grid) == pytest.approx(-by, abs=1e-3)
-        assert scene.convergence(grid) == pytest.approx(turned, abs=0.01)
+        assert georeference.convergence(grid) == pytest.approx(-by, abs=1e-3)
+        assert georeference.convergence(grid) == pytest.approx(turned, abs=0.01)
 
     def test_grads_from_paris_are_not_taken_for_degrees(self, tmp_path):
         place = Affine(5e-6, 0, (1.64 - 2.337229) / 0.9, 0, -3.8e-6, 49.72 / 0.9)
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), "EPSG:4807", transform=place)
-        assert scene.model_grid(path, 0.38).crs == "EPSG:32631"
+        assert georeference.model_grid(path, 0.38).crs == "EPSG:32631"
 
     def test_feet_are_not_taken_for_metres(self, tmp_path):
         path = rasters.write(
             tmp_path / "a.tif", rasters.picture(), "EPSG:2263", transform=Affine(1.0, 0, 980_000, 0, -1.0, 200_000)
         )
-        grid = scene.model_grid(path, 0.3048)
+        grid = georeference.model_grid(path, 0.3048)
         assert grid.width == pytest.approx(110, abs=4)
 
     def test_a_national_grid_is_kept(self, tmp_path):
         path = rasters.write(
             tmp_path / "a.tif", rasters.picture(), "EPSG:7415", transform=Affine(0.38, 0, 92_000, 0, -0.38, 437_000)
         )
-        assert scene.model_grid(path, 0.38).crs == "EPSG:28992"
+        assert georeference.model_grid(path, 0.38).crs == "EPSG:28992"
 
     def test_too_coarse_is_refused(self, tmp_path):
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), gsd=0.62)
-        with pytest.raises(scene.GsdTooCoarse, match=r"0\.62 m"):
-            scene.model_grid(path, 0.38)
-        assert scene.model_grid(path, 0.39).gsd == 0.39
+        with pytest.raises(georeference.GsdTooCoarse, match=r"0\.62 m"):
+            georeference.model_grid(path, 0.38)
+        assert georeference.model_grid(path, 0.39).gsd == 0.39
 
     def test_web_mercator_pixels_are_measured_on_the_ground(self, tmp_path):
         """At 60° N a Web Mercator pixel of 1 m is half a metre."""
@@ -101,7 +101,7 @@ class TestModelGrid:
         path = rasters.write(
             tmp_path / "a.tif", rasters.picture(), "EPSG:3857", transform=Affine(1.0, 0, 1_224_500, 0, -1.0, y)
         )
-        grid = scene.model_grid(path, 0.38)
+        grid = georeference.model_grid(path, 0.38)
         assert grid.width * grid.gsd == pytest.approx(55, abs=3)
 
     @pytest.mark.parametrize("crs", ["EPSG:32631", "EPSG:4326", "EPSG:3857"])
@@ -111,7 +111,7 @@ class TestModelGrid:
         path = rasters.write(tmp_path / "a.tif", rasters.picture())
         box = shapely.box(rasters.X0 + 3.8, rasters.Y0 - 0.38 * 40.5, rasters.X0 + 0.38 * 50.5, rasters.Y0 - 3.8)
         geopandas.GeoSeries([box], crs="EPSG:32631").to_crs(crs).to_file(tmp_path / "aoi.gpkg")
-        grid = scene.model_grid(path, 0.38, tmp_path / "aoi.gpkg")
+        grid = georeference.model_grid(path, 0.38, tmp_path / "aoi.gpkg")
         whole = GRID.to_image(np.array([[grid.x0, grid.y0]]))
         assert np.allclose(whole, np.rint(whole), atol=1e-6)
         assert np.allclose(whole, 10, atol=1.001)
@@ -123,7 +123,7 @@ class TestModelGrid:
         path = rasters.write(tmp_path / "a.tif", rasters.picture())
         around = shapely.box(*GRID.bounds).buffer(100)
         geopandas.GeoSeries([around], crs="EPSG:32631").to_file(tmp_path / "aoi.geojson")
-        assert scene.model_grid(path, 0.38, tmp_path / "aoi.geojson") == GRID
+        assert georeference.model_grid(path, 0.38, tmp_path / "aoi.geojson") == GRID
 
     def test_unusable_aois_are_refused(self, tmp_path):
         import geopandas
@@ -140,33 +140,33 @@ class TestModelGrid:
             ("nowhere.shp", "no CRS"),
             ("missing.gpkg", "cannot be read"),
         ]:
-            with pytest.raises(scene.AoiUnusable, match=says):
-                scene.model_grid(path, 0.38, tmp_path / name)
+            with pytest.raises(georeference.AoiUnusable, match=says):
+                georeference.model_grid(path, 0.38, tmp_path / name)
 
 
 class TestBadRasters:
     def test_missing(self, tmp_path):
         with pytest.raises(imagery.RasterMissing, match="does not exist"):
-            scene.model_grid(tmp_path / "no.tif", 0.38)
+            georeference.model_grid(tmp_path / "no.tif", 0.38)
 
     def test_not_a_raster(self, tmp_path):
         (tmp_path / "a.tif").write_text("hello")
         with pytest.raises(imagery.NotARaster, match="cannot be read"):
-            scene.model_grid(tmp_path / "a.tif", 0.38)
+            georeference.model_grid(tmp_path / "a.tif", 0.38)
 
     def test_no_crs(self, tmp_path):
         with pytest.raises(imagery.NotGeoreferenced, match="no CRS"):
-            scene.model_grid(rasters.write(tmp_path / "a.tif", rasters.picture(), None), 0.38)
+            georeference.model_grid(rasters.write(tmp_path / "a.tif", rasters.picture(), None), 0.38)
 
     def test_no_geotransform(self, tmp_path):
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), transform=Affine.identity())
         with pytest.raises(imagery.NotGeoreferenced, match="geotransform"):
-            scene.model_grid(path, 0.38)
+            georeference.model_grid(path, 0.38)
 
     def test_coordinates_that_the_crs_cannot_hold(self, tmp_path):
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), "EPSG:4326")
         with pytest.raises(imagery.NotGeoreferenced, match="outside the area"):
-            scene.model_grid(path, 0.38)
+            georeference.model_grid(path, 0.38)
 
     def test_no_data(self, tmp_path):
         path = rasters.write(tmp_path / "a.tif", np.zeros((3, 20, 20), "uint16"))
@@ -434,7 +434,7 @@ class TestScene:
 
     @pytest.mark.parametrize("crs", ["EPSG:4326", "hello", "EPSG:999999"])
     def test_a_vertical_crs_must_be_vertical(self, tmp_path, crs):
-        with pytest.raises(scene.VerticalCrsUnusable):
+        with pytest.raises(georeference.VerticalCrsUnusable):
             build(tmp_path, rasters.write(tmp_path / "a.tif", rasters.picture()), vertical_crs=crs)
 
     def test_a_coarser_raster_is_warned_of(self, tmp_path):
@@ -446,10 +446,10 @@ class TestScene:
 
         turned = Affine(0.27, 0.27, rasters.X0, 0.27, -0.27, rasters.Y0)
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), transform=turned)
-        left, bottom, _, _ = scene.model_grid(path, 0.38).bounds
+        left, bottom, _, _ = georeference.model_grid(path, 0.38).bounds
         corner = shapely.box(left, bottom, left + 3, bottom + 3)
         geopandas.GeoSeries([corner], crs="EPSG:32631").to_file(tmp_path / "aoi.gpkg")
-        with pytest.raises(scene.AoiUnusable, match="beside"):
+        with pytest.raises(georeference.AoiUnusable, match="beside"):
             build(tmp_path, path, aoi=tmp_path / "aoi.gpkg")
 
     def test_command_line(self, tmp_path):

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from kibs_steps import cli, store
+from kibs_steps import cli, georeference, store
 from kibs_steps import scene as scenes
 from kibs_steps.mesh import COLOURS, Mesh, by_kind, read
 from kibs_steps.publish import licences
@@ -162,7 +162,7 @@ def main(argv: list[str] | None = None) -> None:
     left, bottom, right, top = scene.grid.bounds
     vertical = store.read_json(args.scene).get("vertical_crs")
     earth = Earth(scene.grid.crs, vertical, (left + right) / 2, (bottom + top) / 2)
-    if lacking := scenes.missing_geoid(scene.grid.crs, vertical):
+    if lacking := georeference.missing_geoid(scene.grid.crs, vertical):
         print(
             f"warning: PROJ lacks the geoid {lacking}: heights of {vertical} are taken from the ellipsoid",
             file=sys.stderr,

@@ -14,8 +14,9 @@ import numpy as np
 from kibs_steps import cli, store
 from kibs_steps import view as geometry
 from kibs_steps.errors import KibsError
+from kibs_steps.georeference import convergence
 from kibs_steps.grid import Grid
-from kibs_steps.scene import Direction, convergence
+from kibs_steps.scene import Direction
 from kibs_steps.simulate import citymodel, real
 from kibs_steps.simulate.camera import CLEAR, Camera
 from kibs_steps.simulate.city import MIXTURES, STYLES, procedural

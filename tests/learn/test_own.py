@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kibs_steps import view
+from kibs_steps.georeference import convergence
 from kibs_steps.grid import Grid, Window
 from kibs_steps.learn import own
 from kibs_steps.learn.samples import UNKNOWN, Sample
-from kibs_steps.scene import Direction, convergence
+from kibs_steps.scene import Direction
 from kibs_steps.simulate import scene as simulation
 
 SIZE, TILE = 300, 120

@@ -4,6 +4,7 @@ import cities
 import numpy as np
 import pytest
 
+from kibs_steps import georeference
 from kibs_steps import terrain as dtm
 from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
@@ -72,7 +73,7 @@ def test_a_surveyed_city_is_seen_where_its_file_says(model, tmp_path):
     x0, y0 = 90 / 2 - 52, 90 / 2 + 52
     surface = dtm.read(out / "dtm.tif", (x0, y0 - 104, x0 + 104, y0))
     grid = Grid("EPSG:28992", x0, y0, 0.4, 260, 260)
-    k = geometry.lean(181.1, 59.3, scene.convergence(grid))
+    k = geometry.lean(181.1, 59.3, georeference.convergence(grid))
     for a, b in zip(seen.geometry, stands.geometry, strict=True):
         image, place = np.array(a.exterior.coords), np.array(b.exterior.coords)
         shown = geometry.image_position(place[:, :2], place[:, 2], k, surface)

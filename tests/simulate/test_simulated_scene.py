@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from kibs_steps import georeference
 from kibs_steps import terrain as dtm
 from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
@@ -223,7 +224,7 @@ def test_program_writes_a_scene_twice_the_same(tmp_path):
     stands = geopandas.read_file(tmp_path / "a" / "truth.gpkg", layer="sections_map")
     assert list(seen.columns) == list(stands.columns) == ["section_id", "building_id", "visible", "split", "geometry"]
     surface = dtm.read(tmp_path / "a" / "dtm.tif", bounds)
-    turned = scene.convergence(Grid("EPSG:32631", bounds.left, bounds.top, 0.38, 220, 220))
+    turned = georeference.convergence(Grid("EPSG:32631", bounds.left, bounds.top, 0.38, 220, 220))
     k = geometry.lean(181.1, 59.3, turned)
     for a, b in zip(seen.geometry[:20], stands.geometry[:20], strict=True):
         image, place = np.array(a.exterior.coords), np.array(b.exterior.coords)
