@@ -55,20 +55,22 @@ def companions(path: Path) -> list[Path]:
     if path.suffix.lower() == ".shp":
         parts = {".dbf", ".prj", ".cpg"}
         return sorted(f for f in path.parent.glob(f"{glob.escape(path.stem)}.*") if f.suffix.lower() in parts)
-    if path.suffix.lower() != ".vrt":
+    found = [path]
+    for file in found:  # which grows: a VRT may name others
+        found += dict.fromkeys(part for part in _named_in(file) if part.is_file() and part not in found)
+    return found[1:]
+
+
+def _named_in(vrt: Path) -> list[Path]:
+    """The sources that a VRT names; none of another file."""
+    if vrt.suffix.lower() != ".vrt":
         return []
     try:
-        named = list(ElementTree.parse(path).iter())
+        elements = list(ElementTree.parse(vrt).iter())
     except (ElementTree.ParseError, OSError):
         return []  # who reads it says what is wrong
-    found: list[Path] = []
-    for element in named:
-        if element.tag in ("SourceFilename", "SourceDataset") and element.text:
-            relative = element.get("relativeToVRT") == "1"
-            part = path.parent / element.text if relative else Path(element.text)
-            if part.is_file() and part not in found:
-                found += [part, *(p for p in companions(part) if p not in found)]
-    return found
+    named = [e for e in elements if e.tag in ("SourceFilename", "SourceDataset") and e.text]
+    return [vrt.parent / e.text if e.get("relativeToVRT") == "1" else Path(e.text) for e in named]
 
 
 def of_values(*values: Any) -> str:

@@ -154,6 +154,8 @@ def test_what_a_file_stands_for_counts_as_its_content(tmp_path):
     first = fingerprint.of_source(whole, cache)
     other.write_bytes(b"c")
     assert fingerprint.of_source(whole, cache) != first
+    whole.write_text(source.format("whole.vrt"))  # which GDAL refuses: it names itself
+    assert fingerprint.companions(whole) == []
     whole.write_text("no xml")
     assert fingerprint.companions(whole) == []
     for end in ("shp", "dbf", "prj", "sbn"):
