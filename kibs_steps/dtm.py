@@ -285,12 +285,11 @@ def _covered_area(
     from shapely import affinity
 
     seen = shapely.make_valid(shapely.Polygon(footprint)).intersection(shapely.box(*grid.bounds))
-    area = (
-        seen if moves is STAYS else shapely.union_all([affinity.translate(seen, *move) for move in moves]).convex_hull
-    )
+    stays = not moves.any()
+    area = seen if stays else shapely.union_all([affinity.translate(seen, *move) for move in moves]).convex_hull
     extent = shapely.Polygon(imagery.outline(source, pyproj.CRS.from_user_input(grid.crs)))
     # What stands a little beyond the terrain model is filled from its rim, what is seen there is not.
-    slack = max(canvas.transform.a, -canvas.transform.e) if moves is STAYS else AROUND
+    slack = max(canvas.transform.a, -canvas.transform.e) if stays else AROUND
     outside = area.difference(extent.buffer(slack))
     if outside.area > 1e-6 * area.area:
         raise DtmPartial(_partial(f"{what} {source.name}", outside.area / area.area))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.accuracy.methods import Method
-from kibs_steps import store
+from kibs_steps import fingerprint, store
 from kibs_steps.errors import KibsError
 from kibs_steps.simulate import scene as simulation
 
@@ -37,7 +37,7 @@ def make(folder: Path, size: int, gsd: float, city: Path | None) -> dict[str, di
     """Render every view once into `folder`; the scenes' settings by set name. Finished ones are left as they are."""
     found = {}
     for number, (name, (azimuth, elevation)) in enumerate(VIEWS.items()):
-        kind = city.stem if city else "procedural"
+        kind = f"{city.stem}-{fingerprint.of_file(city, folder / 'fingerprints.json')[:8]}" if city else "procedural"
         place = folder / f"{kind}-{size}-{gsd:g}-{azimuth:g}-{elevation:g}"
         if not (place / "angles.json").is_file():  # written last
             simulation.main(

@@ -16,9 +16,14 @@ from kibs_steps.models import runtime
 AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their source
 FORGOTTEN = 0.15  # share of training tiles whose view a network is not told; and whose sun
 REPAINTED = 0.3  # share of training tiles whose roofs get another brightness
+LIKENED = 0.7  # share of training tiles that look like the scene a model is fine-tuned for, where there is one
+LENT = 0.25  # share of simulated tiles that look like a chip, where there are any
 PAVED = 0.25  # share of training tiles whose yards are laid with light stone
 GROUND, SHADED_GROUND = 0, 4  # kinds of surface (docs/architecture.md, "Training samples")
 YARD = 22.0  # px, about the side of a yard
+OCTAVES = 3  # of detail, which sensors blur and sharpen
+SHARPENED = 1.5  # most that detail is raised: more would be noise alone
+PERCENTS = np.linspace(0.5, 99.5, 34)  # of pixel values, by which colours are compared
 
 
 def dihedral(sample: Sample, k: int) -> Sample:
@@ -57,10 +62,12 @@ def upright(sample: Sample, rng: np.random.Generator) -> Sample:
     return next(s for s in (dihedral(sample, k) for k in range(8)) if runtime.leans_up(*s.geometry[:2]))
 
 
-def without_geometry(sample: Sample, rng: np.random.Generator, share: float = FORGOTTEN) -> Sample:
-    """Forgets now the view, now the sun, so that a network learns to do without."""
+def without_geometry(
+    sample: Sample, rng: np.random.Generator, shares: tuple[float, float] = (FORGOTTEN, FORGOTTEN)
+) -> Sample:
+    """Forgets now the view, now the sun, each in its share of the tiles, so that a network learns to do without."""
     geometry = sample.geometry.copy()
-    for vector, flag in ((slice(0, 2), 4), (slice(2, 4), 5)):
+    for share, vector, flag in zip(shares, (slice(0, 2), slice(2, 4)), (4, 5), strict=True):
         if rng.random() < share:
             geometry[vector] = 0
             geometry[flag] = 0
@@ -114,6 +121,35 @@ def grain(rng: np.random.Generator, shape: tuple[int, int, int], sigma: float, s
     small = rng.normal(0, 1, (math.ceil(shape[0] / size), math.ceil(shape[1] / size), shape[2]))
     large = cv2.resize(small, shape[1::-1], interpolation=cv2.INTER_CUBIC)
     return sigma / large.std() * large
+
+
+def likened(rgb: np.ndarray, shown: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The tile (h, w, 3) uint8 as the sensor that took the image `shown` might show it: as sharp, and coloured alike.
+
+    Detail is weighed octave by octave against the next coarser one, as what is seen differs; colours go over from half to
+    wholly, band by band, by the order of their values.
+    """
+    own, other = octaves(rgb), octaves(shown)
+    for i in range(OCTAVES):
+        had, wanted = (float(bands[i].std()) / max(float(bands[OCTAVES].std()), 1e-3) for bands in (own, other))
+        own[i] *= min(wanted / max(had, 1e-3), SHARPENED)
+    image = sum(own[1:], own[0])
+    share = rng.uniform(0.5, 1.0)
+    for band in range(3):
+        values = image[..., band]
+        had, wanted = (np.percentile(x[::2, ::2, band], PERCENTS) for x in (image, shown))
+        image[..., band] = (1 - share) * values + share * np.interp(values, had, wanted)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def octaves(rgb: np.ndarray) -> list[np.ndarray]:
+    """An image (h, w, 3) as OCTAVES + 1 bands of detail, finest first, and what is left of it; their sum is the image."""
+    bands, image = [], rgb.astype(np.float32)
+    for i in range(OCTAVES + 1):
+        smooth = cv2.GaussianBlur(image, (0, 0), 0.7 * 2**i)
+        bands.append(image - smooth)
+        image = smooth
+    return [*bands, image]
 
 
 def repainted(sample: Sample, rng: np.random.Generator) -> Sample:

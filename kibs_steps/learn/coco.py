@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 SQUARE = 15  # px: side q of a corner's square (PAPER, data and tiling)
 SECTION = 1  # category id
+UNMOVED = 0.5  # px between a square and that of its exact corner
 
 
 class BadAnnotations(KibsError):
@@ -142,7 +143,8 @@ def read(folder: str | Path, images: str | Path | None = None) -> Iterator[tuple
     """Named samples of `sections.json` and, where it is there, `corners.json`, in order of their ids.
 
     Files of other makers are taken too: polygons as segmentations, corners without exact place (the middle of their box) and
-    height (the centre of their bin); where sections overlap the later annotation lies on top. Without `corners.json` corners
+    height (the centre of their bin), and so are squares that were moved or given another class since their exact values were
+    written; where sections overlap the later annotation lies on top. Without `corners.json` corners
     are unknown; `images` is FOLDER/images unless given. Raises `BadAnnotations`.
     """
     folder = Path(folder)
@@ -208,18 +210,23 @@ def _with_corners(sample: Sample, index: COCO | None, key: int | None) -> Sample
     known = np.full(sample.labels.shape, index is not None, np.uint8)
     if index is None or key is None:
         return sample._replace(corners_known=known)
-    centres = index.dataset.get("info", {}).get("bins", {}).get("centres", paper_bins().centres)
+    info = index.dataset.get("info", {})
+    bins = Bins(**info["bins"]) if "bins" in info else paper_bins()
+    side = info.get("square", SQUARE)
     places, heights = [], []
     for annotation in sorted(index.imgToAnns[key], key=lambda a: a["id"]):
         if annotation.get("iscrowd", 0):
             known[index.annToMask(annotation) > 0] = 0
             continue
         x, y, width, height = annotation["bbox"]
-        places.append(annotation.get("corner", [x + width / 2, y + height / 2]))
+        box = np.array([x, y, x + width, y + height])
+        exact = annotation.get("corner")
+        moved = exact is None or np.abs(squares(np.array([exact]), known.shape, side)[0] - box).max() > UNMOVED
+        places.append([x + width / 2, y + height / 2] if moved else exact)
         kind = annotation["category_id"] - 1
-        middle = centres[kind] if 0 <= kind < len(centres) else np.nan
-        exact = annotation.get("height", middle)
-        heights.append(np.nan if exact is None else exact)
+        exact = np.array([annotation.get("height", np.nan)], float)  # None, null in the file, is NaN too
+        middle = bins.centres[kind] if 0 <= kind < len(bins.centres) else np.nan
+        heights.append(exact[0] if bins.of(exact)[0] == kind else middle)
     return sample._replace(
         corners=np.array(places, np.float32).reshape(-1, 2),
         corner_heights=np.array(heights, np.float32),

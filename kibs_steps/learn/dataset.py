@@ -227,8 +227,9 @@ class Mixture:
 
     `shares` are the probabilities of (simulated, pasted houses, chips, own). Simulated tiles come from `pool`, a folder of
     kept samples that another process may still be filling; while it is empty, the other sources stand in. `own` are files of
-    kept samples (`learn.own`), as those at `gsd`. The share `forget` comes without view, and without sun. Tiles come `upright`,
-    or turned at random; some have their roofs repainted, some their yards paved, some their radiometry changed.
+    kept samples (`learn.own`), as those at `gsd`. The shares `forget` come without view, and without sun. Tiles come `upright`,
+    or turned at random; some have their roofs repainted, some their yards paved, some their radiometry changed; some simulated
+    ones look like a chip, and most like `shown`, windows (n, s, s, 3) uint8 of one scene, where there are any.
     """
 
     def __init__(
@@ -242,9 +243,10 @@ class Mixture:
         own: Sequence[Path] = (),
         upright: bool = True,
         gsd: float = GSD,
-        forget: float = augmentation.FORGOTTEN,
+        forget: tuple[float, float] = (augmentation.FORGOTTEN, augmentation.FORGOTTEN),
+        shown: Sequence[np.ndarray] = (),
     ):
-        self.own, self.upright, self.gsd, self.forget = list(own), upright, gsd, forget
+        self.own, self.upright, self.gsd, self.forget, self.shown = list(own), upright, gsd, forget, shown
         self.pool, self.graphs, self.chips = pool, graphs, chips
         self.shares, self.size, self.seed = shares, size, seed
         self._kept: list[Path] = []
@@ -281,6 +283,12 @@ class Mixture:
         sample = (
             augmentation.upright(sample, rng) if self.upright else augmentation.dihedral(sample, int(rng.integers(8)))
         )
-        if rng.random() >= augmentation.AS_IT_IS:
+        if len(self.shown) and rng.random() < augmentation.LIKENED:
+            window = self.shown[rng.integers(len(self.shown))]
+            sample = sample._replace(rgb=augmentation.likened(sample.rgb, window, rng))
+        elif source == 0 and self.chips and rng.random() < augmentation.LENT:
+            chip = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size, self.gsd)
+            sample = sample._replace(rgb=augmentation.likened(sample.rgb, chip.rgb, rng))
+        elif rng.random() >= augmentation.AS_IT_IS:
             sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
         return sample

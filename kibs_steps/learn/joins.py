@@ -113,11 +113,14 @@ def policy(
 
 
 class Stock(NamedTuple):
-    """What scenes may show beside made-up houses: real cities, photographed roofs, and the ground those are laid on."""
+    """What scenes may show beside made-up houses: real cities, photographed roofs, and the ground those are laid on; windows of
+    an image that they are to look like, and which of view and sun are never told."""
 
     cities: Sequence[citymodel.CityModel] = ()
     graphs: Sequence[photographs.RoofGraph] = ()
     chips: Sequence[photographs.Chip] = ()
+    shown: Sequence[np.ndarray] = ()
+    untold: Sequence[str] = ()
 
 
 NOTHING = Stock()
@@ -130,7 +133,8 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
     if len(stock.graphs) and len(stock.chips) and number % 4 == 3:
         chip = stock.chips[rng.integers(len(stock.chips))]
         ground = dataset.without_truth(dataset.chip_sample(chip, rng, contract["tile"], contract["gsd"]))
-        return dataset.pasted_houses(ground, stock.graphs, rng, gsd=contract["gsd"])
+        sample = dataset.pasted_houses(ground, stock.graphs, rng, gsd=contract["gsd"])
+        return _likened(sample, stock.shown, rng) or sample
     view, sun = (_direction(contract["trained_on"], name) for name in ("view", "sun"))
     sample = dataset.simulated(
         rng,
@@ -142,9 +146,19 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
         gsd=contract["gsd"],
         tall=number % sources.TALL_EVERY == sources.TALL_EVERY - 1,
     )
-    if rng.random() < VARIED:
+    if alike := _likened(sample, stock.shown, rng):
+        sample = alike
+    elif rng.random() < VARIED:
         sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
-    return augmentation.without_geometry(sample, rng, FORGOTTEN)
+    shares = tuple(1.0 if name in stock.untold else FORGOTTEN for name in sources.DIRECTIONS)
+    return augmentation.without_geometry(sample, rng, shares)
+
+
+def _likened(sample: Sample, shown: Sequence[np.ndarray], rng: np.random.Generator) -> Sample | None:
+    """The sample as it would look in one of the windows, in their share of scenes; else None."""
+    if not len(shown) or rng.random() >= augmentation.LIKENED:
+        return None
+    return sample._replace(rgb=augmentation.likened(sample.rgb, shown[rng.integers(len(shown))], rng))
 
 
 def _direction(trained: dict[str, Any], name: str) -> tuple[float, float] | None:
@@ -167,12 +181,13 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
     parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that some of them show parts of")
+    sources.add_look(parser)
     args = parser.parse_args(argv)
     model = contracts.load(args.model, "sections")
     if model.contract["head"] != "dense":
         parser.error(f"{args.model} finds whole sections: there is nothing to join")
     torch.set_num_threads(1)
-    stock = Stock(tuple(map(citymodel.read, args.cities)))
+    stock = Stock(tuple(map(citymodel.read, args.cities)), shown=sources.windows_of(args), untold=args.untold)
     if args.data:
         graphs = photographs.read_roof_graphs(args.roofgraph or Path(args.data) / "roofgraph" / "roofgraph.tar")
         shown = [graph for graph in graphs if not photographs.held_out(graph)]

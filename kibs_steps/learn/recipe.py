@@ -2,7 +2,7 @@
 
 `own` names scenes of the same configuration that have a raster, terrain and truth, or gives such data itself (keys as of a
 scene, and `buildings`, `annotated`; with `scene` only what differs from that one's); `scene` names the scene a model is
-fine-tuned for: tiles are simulated at its angles (also those that `metadata` tell).
+fine-tuned for: tiles are simulated at its angles (also those that `metadata` tell) and made to look like its raster.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ DEFAULTS = {
     "shares": None,
     "device": "cpu",
 }
-ANGLES = tuple(f"{name}_{angle}" for name in ("view", "sun") for angle in ("azimuth", "elevation"))
+PARTS = ("azimuth", "elevation")
+ANGLES = tuple(f"{name}_{part}" for name in ("view", "sun") for part in PARTS)
 OWN = ("raster", "dtm", "truth", "buildings", "annotated", "truth_frame", "truth_z", *ANGLES)
 OWN += ("projection_height", "bands", "aoi")
 # network that is trained -> models made of it
@@ -44,12 +45,13 @@ SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
 
 
 class Recipe(NamedTuple):
-    """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.training` by network,
-    and of `learn.export` and, where basins are joined, `learn.joins` by task."""
+    """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.look` by scene, of
+    `learn.training` by network, and of `learn.export` and, where basins are joined, `learn.joins` by task."""
 
     name: str
     network_of: dict[str, str]
     own: dict[str, dict[str, Any]]
+    look: dict[str, dict[str, Any]]
     training: dict[str, list[str]]
     export: dict[str, list[str]]
     joins: dict[str, list[str]]
@@ -57,8 +59,16 @@ class Recipe(NamedTuple):
     def files(self, own: str) -> list[str]:
         """The files of one own data set that are there."""
         given = self.own[own]
-        named = [given.get(key) for key in ("raster", "dtm", "truth", "buildings", "annotated", "aoi")]
-        return [str(f) for f in named if f is not None and Path(str(f)).is_file()]
+        return _files([given.get(key) for key in ("raster", "dtm", "truth", "buildings", "annotated", "aoi")])
+
+    def seen(self, scene: str) -> list[str]:
+        """The files that tell how a scene looks."""
+        return _files([self.look[scene].get(key) for key in ("raster", "aoi")])
+
+
+def _files(named: list[Any]) -> list[str]:
+    """Of inputs those that are files that are there."""
+    return [str(f) for f in named if f is not None and Path(str(f)).is_file()]
 
 
 def recipe(config: dict[str, Any], base: Path) -> Recipe:
@@ -107,11 +117,16 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
             options += [f"--{key.replace('_', '-')}", *map(str, train[key])]
     if train["shares"]:
         options.append("--shares=" + ",".join(f"{k}={v}" for k, v in train["shares"].items()))
+    look, untold = {}, []
     if train["scene"]:
         scene = settings_of(train["scene"], "scene")
-        if scene.get("view_azimuth") is None or scene.get("view_elevation") is None:
-            raise BadConfig(f"train.scene: {train['scene']} has no view_azimuth and view_elevation to simulate for")
-        options += [f"--{k.replace('_', '-')}={scene[k]}" for k in ANGLES if scene.get(k) is not None]
+        if scene.get("raster") is None:
+            raise BadConfig(f"train.scene: {train['scene']} has no raster to look like")
+        look[train["scene"]] = {k: scene[k] for k in ("raster", "bands", "aoi") if scene.get(k) is not None}
+        told = [name for name in ("view", "sun") if all(scene.get(f"{name}_{a}") is not None for a in PARTS)]
+        untold = [name for name in ("view", "sun") if name not in told]
+        options += [f"--{name}-{a}={scene[f'{name}_{a}']}" for name in told for a in PARTS]
+        options += ["--untold", *untold] if untold else []
     exports = SHARED if (train["family"], train["networks"]) == ("dense", "shared") else SEPARATE
     training = {}
     for network in exports:
@@ -124,18 +139,28 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     shown += [f"--data={train['data']}"] if train["data"] and not train["free"] else []
     for key in ("cities", "leave_out"):
         shown += [f"--{key.replace('_', '-')}", *map(str, train[key])] if train[key] else []
+    shown += ["--untold", *untold] if untold else []
     joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
     joins = {task: shown if task in joining else [] for task in network_of}
-    return Recipe(str(train["name"]), network_of, own, training, export, joins)
+    return Recipe(str(train["name"]), network_of, own, look, training, export, joins)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:
     """The options of `learn.own` for one data set, its tiles at `gsd` (None: as usual)."""
-    listed = {k: ",".join(map(str, v)) if isinstance(v, list) else v for k, v in given.items()}
+    listed = dict(given)
     if "buildings" in listed:
         listed = {k: v for k, v in listed.items() if not k.startswith("truth")}
-    options = [f"--{k.replace('_', '-')}={v}" for k, v in listed.items()] + [f"--split={split}", f"--seed={seed}"]
-    return options + ([f"--gsd={gsd}"] if gsd else [])
+    return [*_options(listed, gsd), f"--split={split}", f"--seed={seed}"]
+
+
+def look_options(given: dict[str, Any], seed: int, gsd: float | None = None) -> list[str]:
+    """The options of `learn.look` for one scene, its windows at `gsd` (None: as usual)."""
+    return [*_options(given, gsd), f"--seed={seed}"]
+
+
+def _options(given: dict[str, Any], gsd: float | None) -> list[str]:
+    listed = {k: ",".join(map(str, v)) if isinstance(v, list) else v for k, v in given.items()}
+    return [f"--{k.replace('_', '-')}={v}" for k, v in listed.items()] + ([f"--gsd={gsd}"] if gsd else [])
 
 
 def like_model(init: str, task: str, base: Path) -> Path | None:

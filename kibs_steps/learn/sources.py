@@ -30,6 +30,7 @@ SHARE_ALIKE = "CC BY-SA 4.0: trained on SpaceNet-2 images under that licence"
 SIMULATED = "MIT, as the code: trained on simulated scenes only"
 OWN = "as the owner of the training data decides"
 TALL_EVERY = 3  # one simulated tile in so many shows tall buildings
+DIRECTIONS = ("view", "sun")  # that networks are told, where they are known
 HELD_OUT = 900_000  # seeds of simulated validation tiles begin here
 TOLD_ANGLES = 3.0  # deg: how far from the one view of its training a fine-tuned model may be used
 
@@ -65,10 +66,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=augmentation.FORGOTTEN,
         help="share of tiles whose view, and whose sun, is not told",
     )
+    add_look(parser)
     parser.add_argument("--validation", type=int, default=0, help="simulated validation tiles, besides the own ones")
     for name in ("view", "sun"):
         parser.add_argument(f"--{name}-azimuth", type=float, help="simulate for one scene: its angle, deg")
         parser.add_argument(f"--{name}-elevation", type=float)
+
+
+def add_look(parser: argparse.ArgumentParser) -> None:
+    """The options that say which scene tiles are to look like."""
+    parser.add_argument(
+        "--look", help="windows of the scene to fine-tune for (learn.look): most tiles are made to look so"
+    )
+    parser.add_argument(
+        "--untold", nargs="*", default=[], choices=DIRECTIONS, help="what no tile is told, as the scene's is unknown"
+    )
+
+
+def windows_of(args: argparse.Namespace) -> np.ndarray:
+    """Windows (n, s, s, 3) uint8 that tiles are to look like; none without `--look`."""
+    return np.load(args.look) if args.look else np.zeros((0, 1, 1, 3), np.uint8)
 
 
 def shares(text: str) -> dict[str, float]:
@@ -107,6 +124,10 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
                 f"{folder} holds samples at {gsd:g} m per px, the model is to be of {args.gsd:g}: "
                 f"make them again with learn.own --gsd={args.gsd:g}"
             )
+    if own and (side := min(Sample.load(own[0]).labels.shape)) < size:
+        raise photographs.NoTrainingData(
+            f"{own[0]} is {side} px wide, a training tile {size} px: make own samples again with learn.own --tile {size} or more"
+        )
     view = _direction(args.view_azimuth, args.view_elevation)
     sun = _direction(args.sun_azimuth, args.sun_elevation)
     if args.tiles:
@@ -119,7 +140,17 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if heights_needed:
         wanted |= {"pasted": 0.0, "chips": 0.0}
     mixture = dataset.Mixture(
-        pool, training, chips, [wanted[name] for name in NAMES], size, args.seed, own, upright, args.gsd, args.forget
+        pool,
+        training,
+        chips,
+        [wanted[name] for name in NAMES],
+        size,
+        args.seed,
+        own,
+        upright,
+        args.gsd,
+        tuple(1.0 if name in args.untold else args.forget for name in DIRECTIONS),
+        windows_of(args),
     )
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
@@ -129,7 +160,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
         dataset.simulated(np.random.default_rng([args.seed, HELD_OUT + i]), view=view, sun=sun, gsd=args.gsd)
         for i in range(args.validation)
     ]
-    validation = [prepared(sample, size, upright) for sample in validation]
+    validation = [prepared(as_seen(sample, args), size, upright) for sample in validation]
     simulates = bool(args.tiles) or any(pool.glob("[!.]*.npz"))
     return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
 
@@ -140,7 +171,18 @@ def signature(args: argparse.Namespace) -> str:
     view, sun = _direction(args.view_azimuth, args.view_elevation), _direction(args.sun_azimuth, args.sun_elevation)
     init = fingerprint.of_source(args.init, Path(args.out) / "fingerprints.json") if args.init else None
     cities = sorted(Path(city).name for city in args.cities)
-    return fingerprint.of_values(records, bool(args.data), args.free, sorted(args.leave_out), cities, view, sun, init)
+    alike = [fingerprint.of_file(args.look, Path(args.out) / "fingerprints.json"), args.untold] if args.look else []
+    return fingerprint.of_values(
+        records, bool(args.data), args.free, sorted(args.leave_out), cities, view, sun, init, *alike
+    )
+
+
+def as_seen(sample: Sample, args: argparse.Namespace) -> Sample:
+    """A validation sample as the scene to fine-tune for looks, told what is known of that."""
+    rng = np.random.default_rng(0)
+    if args.look:
+        sample = sample._replace(rgb=augmentation.likened(sample.rgb, windows_of(args)[0], rng))
+    return augmentation.without_geometry(sample, rng, tuple(float(name in args.untold) for name in DIRECTIONS))
 
 
 def prepared(sample: Sample, size: int, upright: bool) -> Sample:
@@ -166,6 +208,7 @@ def about(
     of = " of SpaceNet-2" if args.free else ""
     data += [f"chips with building masks{of}{without}"] if chips else []
     data += [f"own samples: {Path(folder).name}" for folder in args.own]
+    data += [f"made to look like {Path(args.look).stem}"] if args.look else []
     bound = SHARE_ALIKE if args.free else NON_COMMERCIAL
     licence = bound if graphs or chips else OWN if args.own else SIMULATED
     found: dict[str, Any] = {"data": data, "licence": licence}

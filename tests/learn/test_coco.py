@@ -122,6 +122,19 @@ def test_files_of_other_makers(tmp_path):
     assert not len(found.corners)
 
 
+def test_squares_that_were_moved_or_classed_anew_by_hand_count_as_they_are(tmp_path):
+    """The tool kept the exact corner and height of before in its fields."""
+    coco.write(tmp_path, [("a", sample())], coco.paper_bins())
+    content = json.loads((tmp_path / "corners.json").read_text())
+    content["annotations"][1]["bbox"] = [15, 10, 15, 15]
+    content["annotations"][0]["category_id"] = 9
+    content["annotations"][3]["category_id"] = 20
+    (tmp_path / "corners.json").write_text(json.dumps(content))
+    ((_, found),) = coco.read(tmp_path)
+    np.testing.assert_allclose(found.corners, np.float32([[4.25, 5.5], [22.5, 17.5], [0.5, 39.5], [39.9, 0.1]]))
+    np.testing.assert_array_equal(found.corner_heights, np.float32([9, 6, np.nan, np.nan]))
+
+
 @pytest.mark.parametrize("fault", ["twice", "no image", "another size", "no picture", "no COCO", "nothing"])
 def test_broken_files_are_refused(tmp_path, fault):
     coco.write(tmp_path, [("a", sample()), ("b", sample(1))], coco.paper_bins())

@@ -50,7 +50,7 @@ def test_window_keeps_only_its_corners(marked):
 
 
 def test_forgotten_geometry_is_zero_and_flagged(marked):
-    forgotten = augmentation.without_geometry(marked, np.random.default_rng(0), share=1.0)
+    forgotten = augmentation.without_geometry(marked, np.random.default_rng(0), shares=(1.0, 1.0))
     assert not forgotten.geometry.any()
     assert marked.geometry.any()
 
@@ -154,6 +154,35 @@ def test_radiometry_keeps_shape_and_is_the_same_for_a_seed():
         assert one.shape == rgb.shape
         assert one.dtype == np.uint8
         np.testing.assert_array_equal(one, augmentation.radiometry(rgb, np.random.default_rng(seed)))
+
+
+def test_a_tile_made_to_look_like_its_own_soft_tinted_twin_becomes_it():
+    """Texture with detail at all scales; the twin is blurred by a known kernel and has other colours in the same order."""
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=(128, 128, 3))
+    texture = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (0.6, 1.2, 2.5, 5.0, 10.0))
+    sharp = np.clip(120 + 22 * texture, 0, 255).astype(np.uint8)
+    soft = cv2.GaussianBlur(sharp, (0, 0), 1.5).astype(float)
+    twin = np.clip(255 * (soft / 255) ** 1.6 * [1.0, 0.8, 0.6], 0, 255).astype(np.uint8)
+
+    def far(image):
+        return np.abs(image.astype(float) - twin).mean()
+
+    likened = [augmentation.likened(sharp, twin, np.random.default_rng(seed)) for seed in range(8)]
+    assert min(map(far, likened)) < 0.25 * far(sharp)
+    assert max(map(far, likened)) < 0.7 * far(sharp)  # at least half way
+    detail = [cv2.Laplacian(image.astype(np.float32), cv2.CV_32F).std() for image in (sharp, twin, *likened)]
+    assert detail[0] > 3 * detail[1]
+    assert max(detail[2:]) < 0.5 * detail[0]
+
+
+def test_a_tile_of_one_colour_can_be_made_to_look_like_anything():
+    plain, other = np.full((32, 32, 3), 90, np.uint8), np.full((48, 48, 3), 200, np.uint8)
+    for rgb, shown in ((plain, other), (plain, np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8))):
+        found = augmentation.likened(rgb, shown, np.random.default_rng(1))
+        assert found.shape == rgb.shape
+        assert np.ptp(found) <= 130
+    np.testing.assert_allclose(sum(augmentation.octaves(plain)), plain, atol=1e-3)
 
 
 def test_repainted_roofs_keep_their_shading_and_the_ground_its_look():

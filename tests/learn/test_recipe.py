@@ -80,6 +80,8 @@ def test_fine_tuning_takes_the_scenes_angles_and_the_sets_weights(tmp_path):
     }
     options = recipe.recipe(config, tmp_path).training["both"]
     assert {"--view-azimuth=181.1", "--view-elevation=59.3", f"--init={folder / 'weights.pt'}"} <= set(options)
+    assert options[options.index("--untold") + 1] == "sun"
+    assert recipe.recipe(config, tmp_path).look == {"town": {"raster": "t.tif"}}
     assert "--shares=simulated=0.5,own=0.5" in options
     assert recipe.recipe(config, tmp_path).export == {"both": [], "sections": [], "corners": []}
     (folder / "sections.onnx").touch()
@@ -87,6 +89,21 @@ def test_fine_tuning_takes_the_scenes_angles_and_the_sets_weights(tmp_path):
     (folder / "both.pt").touch()
     assert recipe.weights("free", "both", tmp_path) == folder / "both.pt"
     assert recipe.weights(str(folder / "weights.pt"), "both", tmp_path) == folder / "weights.pt"
+
+
+def test_fine_tuning_for_an_image_of_unknown_view_shows_all_and_tells_none(tmp_path):
+    config = {"scenes": {"town": {"raster": "t.tif", "bands": [5, 3, 2]}}, "train": {"scene": "town", "gsd": 0.25}}
+    found = recipe.recipe(config, tmp_path)
+    for options in (found.training["both"], found.joins["sections"]):
+        assert options[options.index("--untold") :][1:3] == ["view", "sun"]
+        assert not [o for o in options if o.startswith(("--view", "--sun"))]
+    assert set(recipe.look_options(found.look["town"], 3, 0.25)) == {
+        "--raster=t.tif",
+        "--bands=5,3,2",
+        "--gsd=0.25",
+        "--seed=3",
+    }
+    assert not recipe.recipe({}, tmp_path).look
 
 
 def test_own_data_of_a_scene_may_be_given_in_part(tmp_path):
@@ -125,11 +142,11 @@ def test_angles_may_come_from_metadata(tmp_path):
         ({"own": ["nowhere"]}, "no scene 'nowhere'"),
         ({"own": [{"raster": "a.tif", "dtm": 1}]}, "truth .* or buildings"),
         ({"own": [{"raster": "a.tif", "truth": "t.gpkg"}]}, "has no dtm"),
-        ({"scene": "plain"}, "view_azimuth"),
+        ({"scene": "bare"}, "no raster to look like"),
         ({"init": "nothing"}, r"nothing is no file"),
         ({"tiles": 0}, "nothing to learn from"),
     ],
 )
 def test_what_cannot_be_trained_is_said(tmp_path, train, message):
     with pytest.raises(BadConfig, match=message):
-        recipe.recipe({"scenes": {"plain": {"raster": "t.tif"}}, "train": train}, tmp_path)
+        recipe.recipe({"scenes": {"bare": {"dtm": 3}}, "train": train}, tmp_path)

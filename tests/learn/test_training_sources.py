@@ -56,6 +56,28 @@ def test_own_samples_of_another_gsd_are_refused(tmp_path):
     assert sources.gather(arguments("--own", str(folder), "--tiles=0", "--gsd=0.25"), 48).validation
 
 
+def test_own_samples_smaller_than_a_training_tile_are_refused(tmp_path):
+    folder = own(tmp_path / "town")
+    with pytest.raises(photographs.NoTrainingData, match=r"is 64 px wide, a training tile 192 px.*--tile 192"):
+        sources.gather(arguments("--own", str(folder), "--tiles=0"), 192)
+
+
+def test_tiles_look_like_the_scene_to_fine_tune_for_and_are_told_what_is_known_of_it(tmp_path):
+    shown = np.full((3, 64, 64, 3), 200, np.uint8)
+    np.save(tmp_path / "far.npy", shown)
+    words = ("--own", str(own(tmp_path / "town")), "--tiles=0", f"--look={tmp_path / 'far.npy'}", "--untold", "view")
+    found = sources.gather(arguments(*words), 48)
+    tiles = [found.mixture[i] for i in range(60)]
+    bright = sum(tile.rgb.min() >= 90 for tile in tiles)  # of 0 to 30: more than half way to 200
+    assert 28 <= bright <= 52
+    assert not any(tile.geometry[4] for tile in tiles)
+    assert found.validation[0].rgb.min() >= 90
+    assert "made to look like far" in found.about["data"]
+    plain = arguments(*words[:3], f"--out={tmp_path}/run/both")
+    alike = arguments(*words, f"--out={tmp_path}/run/both")
+    assert sources.signature(plain) != sources.signature(alike)
+
+
 def test_a_third_of_the_tiles_keeps_its_look(tmp_path):
     """Half of them keep their radiometry, and of these the roofs of a third are repainted."""
     mixture = sources.gather(arguments("--own", str(own(tmp_path / "town")), "--tiles=0"), 48).mixture

@@ -29,10 +29,30 @@ rule own_samples:
         "python -m kibs_steps.learn.own {params.options:q} --out $(dirname {output:q}) > {log:q} 2>&1"
 
 
+rule look:
+    """How the scene to fine-tune for looks: windows of its raster."""
+    input:
+        lambda w: RECIPE.seen(w.scene),
+    output:
+        "runs/{name}/look/{scene}.npy",
+    log:
+        "runs/{name}/logs/look_{scene}.log",
+    retries: 0
+    conda:
+        LEARN
+    params:
+        options=lambda w: recipes.look_options(
+            RECIPE.look[w.scene], TRAIN["seed"], TRAIN["gsd"]
+        ),
+    shell:
+        "python -m kibs_steps.learn.look {params.options:q} --out {output:q} > {log:q} 2>&1"
+
+
 rule trained:
     """Train one network within its time budget."""
     input:
         own=[f"runs/{RECIPE.name}/own/{own}/own.json" for own in RECIPE.own],
+        look=[f"runs/{RECIPE.name}/look/{scene}.npy" for scene in RECIPE.look],
     output:
         "runs/{name}/{network}/done.json",
     log:
@@ -44,15 +64,17 @@ rule trained:
     params:
         options=lambda w: RECIPE.training[w.network],
         own=lambda w: [f"runs/{w.name}/own/{own}" for own in RECIPE.own],
+        look=lambda w, input: ["--look", *input.look] if input.look else [],
     shell:
-        "python -m kibs_steps.learn.training {params.options:q} --own {params.own:q} --threads {threads}"
+        "python -m kibs_steps.learn.training {params.options:q} {params.look:q} --own {params.own:q} --threads {threads}"
         " --pool runs/{wildcards.name:q}/pool --out $(dirname {output:q}) > {log:q} 2>&1"
 
 
 rule exported:
     """Export a trained network as the ONNX model of one task, with its contract and how basins are joined to sections."""
     input:
-        lambda w: f"runs/{w.name}/{RECIPE.network_of[w.task]}/done.json",
+        done=lambda w: f"runs/{w.name}/{RECIPE.network_of[w.task]}/done.json",
+        look=[f"runs/{RECIPE.name}/look/{scene}.npy" for scene in RECIPE.look],
     output:
         "models/{name}/{task}.onnx",
     log:
@@ -66,10 +88,12 @@ rule exported:
         options=lambda w: RECIPE.export[w.task],
         joins=lambda w: RECIPE.joins[w.task],
         learns=lambda w: "yes" if RECIPE.joins[w.task] else "no",
+        look=lambda w, input: ["--look", *input.look] if input.look else [],
     shell:
-        "python -m kibs_steps.learn.export {params.options:q} --checkpoint $(dirname {input:q})/checkpoint.pt --task {wildcards.task}"
-        " --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
-        " && (test {params.learns} = no || python -m kibs_steps.learn.joins --model {output:q} {params.joins:q} >> {log:q} 2>&1)"
+        "python -m kibs_steps.learn.export {params.options:q} --checkpoint $(dirname {input.done:q})/checkpoint.pt"
+        " --task {wildcards.task} --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
+        " && (test {params.learns} = no"
+        " || python -m kibs_steps.learn.joins --model {output:q} {params.joins:q} {params.look:q} >> {log:q} 2>&1)"
 
 
 rule card:
