@@ -1,8 +1,9 @@
 """Own: training samples of a user's raster and annotation, and their split into training, validation and testing.
 
 In: a raster, its terrain and angles, and either roof sections with heights (PolygonZ, drawn where they are seen or where they
-stand, as `kibs_steps.truth` reads them: height = z − DTM at the ground-corrected position) or plain outlines of buildings as
-seen (roofs known, sections, corners and heights not). Out, below `--out`: `training/`, `validation/`, `testing/` with one
+stand, as `kibs_steps.truth` reads them: height = z − DTM at the ground-corrected position), or plain outlines of buildings as
+seen (roofs known, sections, corners and heights not), or no annotation but a model whose guesses stand in for outlines
+(`learn.guessed`; all tiles are for training then). Out, below `--out`: `training/`, `validation/`, `testing/` with one
 `learn.samples.Sample` per tile (npz); `truth.gpkg`, the annotation with its column `split`; `own.json`, which records inputs,
 rule, seed and counts. The same inputs and seed give the same tiles in the same sets.
 
@@ -26,8 +27,9 @@ from kibs_steps import cli, evaluate, fingerprint, metrics, store, tiles, truth
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Window
-from kibs_steps.learn import dataset
+from kibs_steps.learn import dataset, guessed
 from kibs_steps.learn.samples import UNKNOWN, Sample
+from kibs_steps.models import contract as contracts
 from kibs_steps.models import runtime
 from kibs_steps.scene import Scene
 from kibs_steps.simulate import rendering
@@ -36,6 +38,7 @@ from kibs_steps.truth import Truth
 SPLITS = ("training", "validation", "testing")
 SHARES = (0.6, 0.2, 0.2)
 LEFT_OUT = -1  # in the buffer between training and the other sets
+GUESSED = 200  # most tiles that a model guesses, at some seconds each
 DOUBT = 3  # px about a building's outline in which nobody knows whether there is a corner
 
 
@@ -170,6 +173,35 @@ def codes_of(points: NDArray[np.float64], found: list[Place], code: NDArray[np.i
     return split
 
 
+class Teacher(NamedTuple):
+    """A model whose guesses are learned: what it sees of a window, and its licence."""
+
+    glance: guessed.Glance
+    licence: str
+
+
+def teaching(path: str | Path, scene: Scene, side: int) -> Teacher:
+    """A dense model for sections that looks at samples of `side` px of a scene. Raises `ContractMismatch` for another model,
+    `NothingToLearn` for another GSD, or samples that are larger than its tile."""
+    model = contracts.load(path, "sections")
+    if model.contract["head"] != "dense":
+        raise contracts.ContractMismatch(f"{path} gives no roof probability: --guess takes a dense model for sections")
+    if model.contract["gsd"] != scene.grid.gsd:
+        raise NothingToLearn(
+            f"{path} is for {model.contract['gsd']:g} m per px, the tiles are to be of {scene.grid.gsd:g}: give one for that"
+        )
+    if side > model.contract["tile"]:
+        raise NothingToLearn(f"--tile {side}: {path} looks at {model.contract['tile']} px: make samples no larger")
+    network = runtime.open_network(model, geometry_of(scene)[None])
+    return Teacher(guessed.glancing(scene, network, model.contract["tile"]), model.contract["trained_on"]["licence"])
+
+
+def drawn_places(found: list[Place], seed: int, most: int = GUESSED) -> list[Place]:
+    """Tiles to guess: all, or of many `most` drawn at random, in their order."""
+    kept = np.random.default_rng(seed).permutation(len(found))[:most]
+    return [found[i] for i in sorted(kept.tolist())]
+
+
 def write_truth(path: Path, sections: Truth, scene: Scene, split: NDArray[np.int64]) -> None:
     """The annotation where it stands, absolute heights, with the split of each section: `truth=` of a later evaluation."""
     import geopandas
@@ -192,6 +224,7 @@ def main(argv: list[str] | None = None) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--truth", help="roof sections with heights")
     what.add_argument("--buildings", help="outlines of buildings as seen in the raster, without sections")
+    what.add_argument("--guess", help="no annotation: a dense model for sections (ONNX), whose sure roofs are learned")
     parser.add_argument("--truth-frame", choices=truth.FRAMES, default="map")
     parser.add_argument("--truth-z", choices=truth.VERTICAL, default="absolute")
     parser.add_argument("--annotated", help="polygons outside which nothing was annotated")
@@ -224,14 +257,19 @@ def main(argv: list[str] | None = None) -> None:
     )
     found = places(scene.grid.width, scene.grid.height, args.tile)
     by_blocks = args.split == "blocks"
-    code = in_blocks(found, args.seed, args.square, args.buffer) if by_blocks else shuffled(len(found), args.seed)
+    teacher = teaching(args.guess, scene, args.tile) if args.guess else None
+    if teacher:
+        found = drawn_places(found, args.seed)
+        code = np.zeros(len(found), np.int64)
+    else:
+        code = in_blocks(found, args.seed, args.square, args.buffer) if by_blocks else shuffled(len(found), args.seed)
     annotated = outlines_on(scene, args.annotated) if args.annotated else None
     sections, buildings = None, np.zeros(0, object)
     if args.truth:
         layer = truth.read_layer(args.truth, args.truth_frame)
         store.write_table(args.out / "scene/truth.parquet", truth.table(layer, scene, args.truth_frame, args.truth_z))
         sections = truth.read(args.out / "scene/truth.parquet", scene)
-    else:
+    elif args.buildings:
         buildings = outlines_on(scene, args.buildings)
     for name in SPLITS:  # tiles of an earlier cut would be of another set now
         shutil.rmtree(args.out / name, ignore_errors=True)
@@ -241,7 +279,9 @@ def main(argv: list[str] | None = None) -> None:
             continue
         window = place.window
         unknown = np.zeros((window.height, window.width), bool) if annotated is None else ~drawn(annotated, window)
-        if sections is None:
+        if teacher:
+            sample = guessed.sample(teacher.glance, window, geometry_of(scene))
+        elif sections is None:
             sample = building_sample(scene, buildings, window, unknown)
         else:
             sample = section_sample(scene, sections, window, unknown)
@@ -254,7 +294,7 @@ def main(argv: list[str] | None = None) -> None:
     known = np.concatenate([*heights, np.zeros(0, np.float32)])
     known = known[np.isfinite(known)]
     counts = {name: int((code == i).sum()) for i, name in enumerate(SPLITS)} | {"left_out": int((code < 0).sum())}
-    source = args.truth or args.buildings
+    source = args.truth or args.buildings or args.guess
     record = {
         "raster": fingerprint.of_file(args.raster, args.out / "fingerprints.json"),
         "annotation": fingerprint.of_file(source, args.out / "fingerprints.json"),
@@ -269,6 +309,8 @@ def main(argv: list[str] | None = None) -> None:
             "sigma": float(known.std()) if len(known) else None,
         },
     }
+    if teacher:
+        record["licence"] = teacher.licence
     store.write_json(args.out / "own.json", record, summed=False)
     print(f"{args.out}: {', '.join(f'{n} {name}' for name, n in counts.items())} tiles")
 

@@ -1,7 +1,7 @@
 """Recipe: what `snakemake train` does, from the config key `train` to the options of its programs; needs no torch.
 
 `own` names scenes of the same configuration that have a raster, terrain and truth, or gives such data itself (keys as of a
-scene, and `buildings`, `annotated`; with `scene` only what differs from that one's); `scene` names the scene a model is
+scene, and `buildings`, `guess`, `annotated`; with `scene` only what differs from that one's); `scene` names the scene a model is
 fine-tuned for: tiles are simulated at its angles (also those that `metadata` tell) and made to look like its raster.
 """
 
@@ -37,8 +37,9 @@ DEFAULTS = {
 }
 PARTS = ("azimuth", "elevation")
 ANGLES = tuple(f"{name}_{part}" for name in ("view", "sun") for part in PARTS)
-OWN = ("raster", "dtm", "truth", "buildings", "annotated", "truth_frame", "truth_z", *ANGLES)
+OWN = ("raster", "dtm", "truth", "buildings", "guess", "annotated", "truth_frame", "truth_z", *ANGLES)
 OWN += ("projection_height", "bands", "aoi")
+ANNOTATIONS = ("truth", "buildings", "guess")
 # network that is trained -> models made of it
 SHARED = {"both": ("both", "sections", "corners")}
 SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
@@ -59,7 +60,7 @@ class Recipe(NamedTuple):
     def files(self, own: str) -> list[str]:
         """The files of one own data set that are there."""
         given = self.own[own]
-        return _files([given.get(key) for key in ("raster", "dtm", "truth", "buildings", "annotated", "aoi")])
+        return _files([given.get(key) for key in ("raster", "dtm", *ANNOTATIONS, "annotated", "aoi")])
 
     def seen(self, scene: str) -> list[str]:
         """The files that tell how a scene looks."""
@@ -90,9 +91,11 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
         item = {"scene": item} if isinstance(item, str) else item
         given = {**settings_of(item["scene"], "own"), **item} if "scene" in item else seen({**common, **item})
         name = str(item.get("name", item.get("scene", f"own{i}")))
-        if "buildings" in item and "truth" not in item:
+        if "truth" not in item and ("buildings" in item or "guess" in item):
             given.pop("truth", None)
         chosen = {k: given[k] for k in OWN if given.get(k) is not None}
+        if "guess" in chosen:
+            chosen["guess"] = str(guessing(chosen["guess"], base))
         if given.get("regions"):
             raise BadConfig(
                 f"train.own: {name} has regions: one view is learned from. Give each region its own aoi and angles"
@@ -100,8 +103,10 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
         for key in ("raster", "dtm"):
             if key not in chosen:
                 raise BadConfig(f"train.own: {name} has no {key}")
-        if ("truth" in chosen) == ("buildings" in chosen):
-            raise BadConfig(f"train.own: {name} needs either truth (roof sections) or buildings (outlines)")
+        if sum(key in chosen for key in ANNOTATIONS) != 1:
+            raise BadConfig(
+                f"train.own: {name} needs one of truth (roof sections), buildings (outlines) and guess (a model set)"
+            )
         if name in own:
             raise BadConfig(f"train.own: two data sets are called {name}: give one another name")
         own[name] = chosen
@@ -148,7 +153,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:
     """The options of `learn.own` for one data set, its tiles at `gsd` (None: as usual)."""
     listed = dict(given)
-    if "buildings" in listed:
+    if "truth" not in listed:
         listed = {k: v for k, v in listed.items() if not k.startswith("truth")}
     return [*_options(listed, gsd), f"--split={split}", f"--seed={seed}"]
 
@@ -170,13 +175,25 @@ def like_model(init: str, task: str, base: Path) -> Path | None:
     return path if path.is_file() else None
 
 
+def guessing(models: str, base: Path) -> Path:
+    """The model of a set, or a file, whose guesses are learned. Raises `BadConfig` where there is none."""
+    path = Path(models) if Path(models).is_file() else folder_of(models, base) / "sections.onnx"
+    if not path.is_file():
+        raise BadConfig(f"train.own: guess: {models} is no file, and there is no {path}")
+    return path
+
+
 def weights(init: str, network: str, base: Path) -> Path:
-    """The weights to start from: a file, or of a model set its `NETWORK.pt`, `weights.pt` or only `.pt` file."""
+    """The weights to start from: a file, or of a model set its `NETWORK.pt`, `weights.pt` or only `.pt` file, or what the run of
+    that name has learned here."""
     if Path(init).is_file():
         return Path(init)
     folder = folder_of(init, base)
     named = [folder / f"{network}.pt", folder / "weights.pt"]
     found = [f for f in named if f.is_file()] or sorted(folder.glob("*.pt"))
+    learned = Path("runs") / init / network / "checkpoint.pt"
+    if not found and learned.is_file():
+        return learned
     if not found or (len(found) > 1 and found[0] not in named):
         apart = "" if network != "both" else " (a set with sections.pt and corners.pt needs networks: separate)"
         raise BadConfig(f"train.init: {init} is no file, and {folder} holds no {network}.pt or weights.pt{apart}")

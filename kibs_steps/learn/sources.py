@@ -210,9 +210,10 @@ def about(
     data += [f"own samples: {Path(folder).name}" for folder in args.own]
     data += [f"made to look like {Path(args.look).stem}"] if args.look else []
     bound = SHARE_ALIKE if args.free else NON_COMMERCIAL
-    licence = bound if graphs or chips else OWN if args.own else SIMULATED
-    found: dict[str, Any] = {"data": data, "licence": licence}
     records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
+    licence = bound if graphs or chips else OWN if args.own else SIMULATED
+    teachers = [record["licence"] for record in records if record.get("licence", SIMULATED) != SIMULATED]
+    found: dict[str, Any] = {"data": data, "licence": "; and ".join(dict.fromkeys([licence, *teachers]))}
     for name, direction in (("view", view), ("sun", sun)):
         # Simulated tiles show all directions unless one is asked for; own ones alone show theirs.
         shown = [direction] if simulates else [tuple(r[name]) if r[name] else None for r in records]

@@ -7,6 +7,7 @@ import pyogrio
 import pytest
 import rasterio
 import shapely
+import toy
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -103,6 +104,38 @@ def test_the_truth_comes_back_with_its_split(city, tmp_path):
     assert set(written["section_id"]) <= set(original["section_id"])
     assert set(written["split"]) == {0, 1, 2}
     assert shapely.has_z(written.geometry.to_numpy()).all()
+
+
+def test_what_a_model_is_sure_of_stands_in_for_an_annotation(tmp_path):
+    """Red is roof to the toy model, less red is doubt; the rest of the raster is ground, a strip of it without data."""
+    image = np.full((90, 130, 3), (90, 110, 80), np.uint8)
+    image[20:40, 30:60] = (200, 60, 60)
+    image[60:75, 80:110] = (150, 60, 60)
+    image[:, 125:] = 0
+    raster = toy.raster(tmp_path / "town.tif", image)
+    with rasterio.open(raster, "r+") as target:
+        target.nodata = 0
+    model = toy.sections_model(tmp_path / "sections.onnx")
+    words = [f"--raster={raster}", "--dtm=0", f"--guess={model}", f"--out={tmp_path / 'own'}"]
+    own.main([*words, "--tile=60"])
+    record = json.loads((tmp_path / "own/own.json").read_text())
+    assert record["licence"] == "CC0-1.0"
+    assert record["split"]["tiles"] == {"training": 6, "validation": 0, "testing": 0, "left_out": 0}
+    for place in own.places(130, 90, 60):
+        sample = Sample.load(tmp_path / f"own/training/r{place.row:03d}c{place.col:03d}.npz")
+        left, top = place.window.col, place.window.row
+        red = image[top : top + 60, left : left + 60, 0]
+        np.testing.assert_array_equal(sample.roof, np.select([red == 200, red == 90], [1, 0], UNKNOWN))
+        np.testing.assert_array_equal(sample.labels, np.where(red == 90, 0, -1))
+        np.testing.assert_array_equal(sample.rgb[red == 200], image[top : top + 60, left : left + 60][red == 200])
+        assert not sample.corners_known.any()
+        assert not np.isfinite(sample.height).any()
+    for tile, message in ((80, "looks at 64 px"), (500, "a training tile 500 px")):
+        with pytest.raises(own.NothingToLearn, match=message):
+            own.main([*words, f"--tile={tile}"])
+    with pytest.raises(own.NothingToLearn, match=r"is for 0.38 m per px, the tiles are to be of 0.76"):
+        own.main([*words, "--tile=40", "--gsd=0.76"])
+    assert len(own.drawn_places(own.places(900, 900, 60), 1, most=20)) == 20
 
 
 def test_buildings_without_sections(city, tmp_path):

@@ -106,6 +106,33 @@ def test_fine_tuning_for_an_image_of_unknown_view_shows_all_and_tells_none(tmp_p
     assert not recipe.recipe({}, tmp_path).look
 
 
+def test_a_set_that_was_trained_here_is_trained_on(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for file in ("models/mine/sections.onnx", "runs/mine/sections/checkpoint.pt"):
+        (tmp_path / file).parent.mkdir(parents=True)
+        (tmp_path / file).touch()
+    with pytest.raises(BadConfig, match="corners"):
+        recipe.recipe({"train": {"init": "mine", "networks": "separate"}}, tmp_path)
+    (tmp_path / "runs/mine/corners").mkdir()
+    (tmp_path / "runs/mine/corners/checkpoint.pt").touch()
+    found = recipe.recipe({"train": {"init": "mine", "networks": "separate"}}, tmp_path)
+    assert "--init=runs/mine/corners/checkpoint.pt" in found.training["corners"]
+    assert found.export["sections"] == [f"--like={tmp_path}/models/mine/sections.onnx"]
+
+
+def test_a_scene_nobody_annotated_is_guessed_by_a_model(tmp_path):
+    folder = tmp_path / "models/mine"
+    folder.mkdir(parents=True)
+    train = {"own": [{"scene": "town", "guess": "mine"}]}
+    with pytest.raises(BadConfig, match=r"guess: mine is no file, and there is no .*sections.onnx"):
+        recipe.recipe({"scenes": {"town": TOWN}, "train": train}, tmp_path)
+    (folder / "sections.onnx").touch()
+    found = recipe.recipe({"scenes": {"town": TOWN}, "train": train}, tmp_path)
+    assert f"--guess={folder / 'sections.onnx'}" in recipe.own_options(found.own["town"], "blocks", 0)
+    assert not [o for o in recipe.own_options(found.own["town"], "blocks", 0) if o.startswith("--truth")]
+    assert found.files("town") == [str(folder / "sections.onnx")]
+
+
 def test_own_data_of_a_scene_may_be_given_in_part(tmp_path):
     train = {
         "own": [{"scene": "town", "annotated": "a.gpkg"}, {"scene": "town", "name": "outlines", "buildings": "b.gpkg"}]
@@ -140,7 +167,7 @@ def test_angles_may_come_from_metadata(tmp_path):
     [
         ({"own": [{"raster": "a.tif", "dtm": 1, "truth": "t.gpkg", "regions": "r.gpkg"}]}, "has regions"),
         ({"own": ["nowhere"]}, "no scene 'nowhere'"),
-        ({"own": [{"raster": "a.tif", "dtm": 1}]}, "truth .* or buildings"),
+        ({"own": [{"raster": "a.tif", "dtm": 1}]}, "truth .* buildings .* guess"),
         ({"own": [{"raster": "a.tif", "truth": "t.gpkg"}]}, "has no dtm"),
         ({"scene": "bare"}, "no raster to look like"),
         ({"init": "nothing"}, r"nothing is no file"),

@@ -56,6 +56,16 @@ def test_own_samples_of_another_gsd_are_refused(tmp_path):
     assert sources.gather(arguments("--own", str(folder), "--tiles=0", "--gsd=0.25"), 48).validation
 
 
+def test_who_learns_from_a_models_guesses_is_bound_by_its_licence(tmp_path):
+    folder = own(tmp_path / "town")
+    record = store.read_json(folder / "own.json")
+    store.write_json(folder / "own.json", {**record, "licence": "CC BY-NC 4.0"})
+    found = sources.gather(arguments("--own", str(folder), "--tiles=0"), 48)
+    assert found.about["licence"] == f"{sources.OWN}; and CC BY-NC 4.0"
+    store.write_json(folder / "own.json", {**record, "licence": sources.SIMULATED})
+    assert sources.gather(arguments("--own", str(folder), "--tiles=0"), 48).about["licence"] == sources.OWN
+
+
 def test_own_samples_smaller_than_a_training_tile_are_refused(tmp_path):
     folder = own(tmp_path / "town")
     with pytest.raises(photographs.NoTrainingData, match=r"is 64 px wide, a training tile 192 px.*--tile 192"):
