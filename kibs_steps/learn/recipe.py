@@ -43,14 +43,17 @@ ANNOTATIONS = ("truth", "buildings", "guess")
 # network that is trained -> models made of it
 SHARED = {"both": ("both", "sections", "corners")}
 SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
+ALONE = {"sections": ("sections",)}
 
 
 class Recipe(NamedTuple):
-    """One `train`: the set's name, model by task -> network, options of `learn.own` by data, of `learn.look` by scene, of
-    `learn.training` by network, and of `learn.export` and, where basins are joined, `learn.joins` by task."""
+    """One `train`: the set's name, model by task -> network, models that are taken as they are by task, options of `learn.own` by
+    data, of `learn.look` by scene, of `learn.training` by network, and of `learn.export` and, where basins are joined,
+    `learn.joins` by task."""
 
     name: str
     network_of: dict[str, str]
+    taken: dict[str, str]
     own: dict[str, dict[str, Any]]
     look: dict[str, dict[str, Any]]
     training: dict[str, list[str]]
@@ -132,7 +135,9 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
         untold = [name for name in ("view", "sun") if name not in told]
         options += [f"--{name}-{a}={scene[f'{name}_{a}']}" for name in told for a in PARTS]
         options += ["--untold", *untold] if untold else []
-    exports = SHARED if (train["family"], train["networks"]) == ("dense", "shared") else SEPARATE
+    exports = {"shared": SHARED, "separate": SEPARATE, "sections": ALONE}[train["networks"]]
+    exports = SEPARATE if train["family"] == "maskrcnn" and exports is SHARED else exports
+    taken = {"corners": str(taking(train["init"], "corners", base))} if exports is ALONE else {}
     training = {}
     for network in exports:
         init = [f"--init={weights(train['init'], network, base)}"] if train["init"] else []
@@ -147,7 +152,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     shown += ["--untold", *untold] if untold else []
     joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
     joins = {task: shown if task in joining else [] for task in network_of}
-    return Recipe(str(train["name"]), network_of, own, look, training, export, joins)
+    return Recipe(str(train["name"]), network_of, taken, own, look, training, export, joins)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:
@@ -173,6 +178,17 @@ def like_model(init: str, task: str, base: Path) -> Path | None:
     folder = Path(init).parent if Path(init).is_file() else folder_of(init, base)
     path = folder / f"{task}.onnx"
     return path if path.is_file() else None
+
+
+def taking(init: str | None, task: str, base: Path) -> Path:
+    """The model of another task that a set which is trained in part keeps from the one it started from. Raises `BadConfig`."""
+    path = like_model(init, task, base) if init else None
+    if path is None:
+        raise BadConfig(
+            f"train: networks: sections keeps the {task} of the set that `init` names: {init or 'it'} has no {task}.onnx; name "
+            "one that has, or train both (networks: separate)"
+        )
+    return path
 
 
 def guessing(models: str, base: Path) -> Path:

@@ -26,6 +26,22 @@ def test_the_papers_pair_is_two_networks_and_ours_may_be(tmp_path, settings):
     assert "--task=corners" in found.training["corners"]
 
 
+def test_sections_may_be_trained_alone_and_corners_kept(tmp_path):
+    (tmp_path / "models/free").mkdir(parents=True)
+    for file in ("sections.pt", "sections.onnx"):
+        (tmp_path / "models/free" / file).touch()
+    train = {"networks": "sections", "init": "free"}
+    with pytest.raises(BadConfig, match=r"free has no corners.onnx"):
+        recipe.recipe({"train": train}, tmp_path)
+    (tmp_path / "models/free/corners.onnx").touch()
+    found = recipe.recipe({"train": train}, tmp_path)
+    assert (set(found.training), set(found.network_of)) == ({"sections"}, {"sections"})
+    assert found.taken == {"corners": f"{tmp_path}/models/free/corners.onnx"}
+    assert not recipe.recipe({"train": {**train, "networks": "separate", "init": None}}, tmp_path).taken
+    with pytest.raises(BadConfig, match="of the set that `init` names"):
+        recipe.recipe({"train": {"networks": "sections"}}, tmp_path)
+
+
 def test_another_gsd_is_that_of_the_network_and_of_own_tiles(tmp_path):
     found = recipe.recipe({"scenes": {"town": TOWN}, "train": {"own": ["town"], "gsd": 0.25}}, tmp_path)
     assert "--gsd=0.25" in found.training["both"]

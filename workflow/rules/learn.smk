@@ -80,7 +80,7 @@ rule exported:
     log:
         "runs/{name}/logs/export_{task}.log",
     wildcard_constraints:
-        task="both|sections|corners",
+        task="|".join(RECIPE.network_of),
     retries: 0
     conda:
         LEARN
@@ -94,6 +94,23 @@ rule exported:
         " --task {wildcards.task} --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
         " && (test {params.learns} = no"
         " || python -m kibs_steps.learn.joins --model {output:q} {params.joins:q} {params.look:q} >> {log:q} 2>&1)"
+
+
+rule taken:
+    """A model that a set trained in part keeps from the one it started from."""
+    input:
+        lambda w: RECIPE.taken[w.task],
+    output:
+        "models/{name}/{task}.onnx",
+    log:
+        "runs/{name}/logs/taken_{task}.log",
+    wildcard_constraints:
+        task="|".join(RECIPE.taken) or "none",
+    retries: 0
+    conda:
+        LEARN
+    shell:
+        "cp {input:q} {output:q} > {log:q} 2>&1"
 
 
 rule card:
@@ -119,5 +136,8 @@ rule card:
 rule train:
     """Train a model set as the config key `train` says (docs/models.md)."""
     input:
-        [f"models/{RECIPE.name}/{task}.onnx" for task in RECIPE.network_of],
+        [
+            f"models/{RECIPE.name}/{task}.onnx"
+            for task in [*RECIPE.network_of, *RECIPE.taken]
+        ],
         f"models/{RECIPE.name}/README.md",
