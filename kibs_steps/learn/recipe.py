@@ -113,6 +113,9 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
         if name in own:
             raise BadConfig(f"train.own: two data sets are called {name}: give one another name")
         own[name] = chosen
+    teachers = [train["init"], *(item.get("guess") for item in train["own"] if not isinstance(item, str))]
+    if train["name"] in teachers:
+        raise BadConfig(f"train: the set {train['name']} cannot be made from itself: give what is trained another name")
     if not own and not train["data"] and not train["tiles"]:
         raise BadConfig("train: nothing to learn from: give own, data or tiles")
 

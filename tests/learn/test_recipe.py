@@ -127,11 +127,12 @@ def test_a_set_that_was_trained_here_is_trained_on(tmp_path, monkeypatch):
     for file in ("models/mine/sections.onnx", "runs/mine/sections/checkpoint.pt"):
         (tmp_path / file).parent.mkdir(parents=True)
         (tmp_path / file).touch()
+    train = {"name": "again", "init": "mine", "networks": "separate"}
     with pytest.raises(BadConfig, match="corners"):
-        recipe.recipe({"train": {"init": "mine", "networks": "separate"}}, tmp_path)
+        recipe.recipe({"train": train}, tmp_path)
     (tmp_path / "runs/mine/corners").mkdir()
     (tmp_path / "runs/mine/corners/checkpoint.pt").touch()
-    found = recipe.recipe({"train": {"init": "mine", "networks": "separate"}}, tmp_path)
+    found = recipe.recipe({"train": train}, tmp_path)
     assert "--init=runs/mine/corners/checkpoint.pt" in found.training["corners"]
     assert found.export["sections"] == [f"--like={tmp_path}/models/mine/sections.onnx"]
 
@@ -139,7 +140,7 @@ def test_a_set_that_was_trained_here_is_trained_on(tmp_path, monkeypatch):
 def test_a_scene_nobody_annotated_is_guessed_by_a_model(tmp_path):
     folder = tmp_path / "models/mine"
     folder.mkdir(parents=True)
-    train = {"own": [{"scene": "town", "guess": "mine"}]}
+    train = {"name": "again", "own": [{"scene": "town", "guess": "mine"}]}
     with pytest.raises(BadConfig, match=r"guess: mine is no file, and there is no .*sections.onnx"):
         recipe.recipe({"scenes": {"town": TOWN}, "train": train}, tmp_path)
     (folder / "sections.onnx").touch()
@@ -188,6 +189,7 @@ def test_angles_may_come_from_metadata(tmp_path):
         ({"scene": "bare"}, "no raster to look like"),
         ({"init": "nothing"}, r"nothing is no file"),
         ({"tiles": 0}, "nothing to learn from"),
+        ({"name": "a", "init": "a"}, "set a cannot be made from itself"),
     ],
 )
 def test_what_cannot_be_trained_is_said(tmp_path, train, message):

@@ -10,6 +10,10 @@ except KibsError as error:
     raise WorkflowError(str(error)) from None
 
 
+wildcard_constraints:
+    name=re.escape(RECIPE.name),  # other sets are inputs, and nothing to make anew
+
+
 rule own_samples:
     """Training, validation and testing tiles of a raster with its annotation."""
     input:
