@@ -17,7 +17,6 @@ AS_IT_IS = 0.5  # share of training tiles whose radiometry stays that of their s
 FORGOTTEN = 0.15  # share of training tiles whose view a network is not told; and whose sun
 REPAINTED = 0.3  # share of training tiles whose roofs get another brightness
 LIKENED = 0.7  # share of training tiles that look like the scene a model is fine-tuned for, where there is one
-LENT = 0.25  # share of simulated tiles that look like a chip, where there are any
 PAVED = 0.25  # share of training tiles whose yards are laid with light stone
 GROUND, SHADED_GROUND = 0, 4  # kinds of surface (docs/architecture.md, "Training samples")
 YARD = 22.0  # px, about the side of a yard

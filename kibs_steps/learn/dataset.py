@@ -228,8 +228,8 @@ class Mixture:
     `shares` are the probabilities of (simulated, pasted houses, chips, own). Simulated tiles come from `pool`, a folder of
     kept samples that another process may still be filling; while it is empty, the other sources stand in. `own` are files of
     kept samples (`learn.own`), as those at `gsd`. The shares `forget` come without view, and without sun. Tiles come `upright`,
-    or turned at random; some have their roofs repainted, some their yards paved, some their radiometry changed; some simulated
-    ones look like a chip, and most like `shown`, windows (n, s, s, 3) uint8 of one scene, where there are any.
+    or turned at random; some have their roofs repainted, some their yards paved, some their radiometry changed; most look like
+    `shown`, windows (n, s, s, 3) uint8 of one scene, where there are any.
     """
 
     def __init__(
@@ -286,9 +286,6 @@ class Mixture:
         if len(self.shown) and rng.random() < augmentation.LIKENED:
             window = self.shown[rng.integers(len(self.shown))]
             sample = sample._replace(rgb=augmentation.likened(sample.rgb, window, rng))
-        elif source == 0 and self.chips and rng.random() < augmentation.LENT:
-            chip = chip_sample(self.chips[rng.integers(len(self.chips))], rng, self.size, self.gsd)
-            sample = sample._replace(rgb=augmentation.likened(sample.rgb, chip.rgb, rng))
         elif rng.random() >= augmentation.AS_IT_IS:
             sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
         return sample
