@@ -242,6 +242,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--buffer", type=int, default=64, help="px between training and other sets (blocks)")
     parser.add_argument("--out", required=True, type=Path)
     args = parser.parse_args(argv)
+    if args.guess and args.annotated:
+        parser.error("--annotated goes with --truth or --buildings: of what a model guesses nothing is annotated")
     dtm = float(args.dtm) if _is_number(args.dtm) else args.dtm
     scene = scenes.build(
         args.out.name,

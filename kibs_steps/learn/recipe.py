@@ -110,6 +110,8 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
             raise BadConfig(
                 f"train.own: {name} needs one of truth (roof sections), buildings (outlines) and guess (a model set)"
             )
+        if "guess" in chosen and "annotated" in chosen:
+            raise BadConfig(f"train.own: {name} has annotated, but of what a model guesses nothing is: leave one out")
         if name in own:
             raise BadConfig(f"train.own: two data sets are called {name}: give one another name")
         own[name] = chosen

@@ -186,6 +186,10 @@ def test_angles_may_come_from_metadata(tmp_path):
         ({"own": ["nowhere"]}, "no scene 'nowhere'"),
         ({"own": [{"raster": "a.tif", "dtm": 1}]}, "truth .* buildings .* guess"),
         ({"own": [{"raster": "a.tif", "truth": "t.gpkg"}]}, "has no dtm"),
+        (
+            {"own": [{"raster": "a.tif", "dtm": 1, "guess": __file__, "annotated": "a.gpkg"}]},
+            "guesses nothing is: leave one out",
+        ),
         ({"scene": "bare"}, "no raster to look like"),
         ({"init": "nothing"}, r"nothing is no file"),
         ({"tiles": 0}, "nothing to learn from"),
