@@ -127,12 +127,11 @@ def inherited(about: dict[str, Any], before: dict[str, Any] | None) -> dict[str,
         if about.get("init", "none") in FRESH or "licence" not in about:
             return about
         return {**about, "licence": f"{about['licence']}; and as the weights it started from ({about['init']}) allow"}
-    licences = dict.fromkeys([before["licence"], about.get("licence", before["licence"])])
-    binding = [licence for licence in licences if licence != sources.SIMULATED] or [sources.SIMULATED]
+    licence = sources.together(before["licence"], about.get("licence", before["licence"]))
     data = list(about.get("data", []))
     earlier = (what.removeprefix(BEFORE) for what in before["data"])
     data += [BEFORE + what for what in dict.fromkeys(earlier) if what not in data]
-    return {**about, "data": data, "licence": "; and ".join(binding)}
+    return {**about, "data": data, "licence": licence}
 
 
 def corner_height_moments(pool: Path, most: int = 300) -> tuple[float, float] | None:
@@ -233,7 +232,7 @@ def main(argv: list[str] | None = None) -> None:
     if "step" not in state:
         parser.error(f"--checkpoint {args.checkpoint}: weights alone, for training --init; give a run's checkpoint.pt")
     task, settings = args.task, training.Settings(**state["settings"])
-    average = state.get("best", {}).get("average") or state["average"]
+    average = training.averaged(state)
     gsd = args.gsd or settings.gsd
     if gsd != settings.gsd and (task, settings.family) != ("sections", "dense"):
         parser.error(f"--gsd {gsd:g}: only a dense network for sections alone can be made into a model for another GSD")

@@ -22,6 +22,7 @@ SIDE = 256  # px
 MOST = 64  # windows
 TRIES = 8  # places looked at for every window wanted
 FILLED = 0.95  # least share of a window's pixels that hold data
+PLAIN = 1 / 3  # of the usual contrast: windows with less are water or a field, and no tile is to look like those
 
 
 class NothingToSee(KibsError):
@@ -29,7 +30,8 @@ class NothingToSee(KibsError):
 
 
 def windows(scene: Scene, seed: int, most: int = MOST, side: int = SIDE) -> np.ndarray:
-    """Windows (n, s, s, 3) uint8 of a scene's image on the model grid, drawn at random; smaller ones of a small raster.
+    """Windows (n, s, s, 3) uint8 of a scene's image on the model grid, drawn at random, without those that are nearly
+    of one colour; smaller ones of a small raster.
 
     Raises `NothingToSee` where none holds enough data.
     """
@@ -48,7 +50,9 @@ def windows(scene: Scene, seed: int, most: int = MOST, side: int = SIDE) -> np.n
             f"{scene.raster}: of {TRIES * most} windows of {side} px none holds data in {FILLED:.0%} of its pixels: set `aoi` to "
             "the part that does"
         )
-    return np.stack(found)
+    kept = np.stack(found)
+    contrast = kept.std(axis=(1, 2)).mean(axis=1)
+    return kept[contrast >= PLAIN * np.median(contrast)]
 
 
 def main(argv: list[str] | None = None) -> None:

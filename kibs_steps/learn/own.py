@@ -258,13 +258,14 @@ def main(argv: list[str] | None = None) -> None:
         projection_height=args.projection_height,
     )
     found = places(scene.grid.width, scene.grid.height, args.tile)
-    by_blocks = args.split == "blocks"
+    rule = "none" if args.guess else args.split
     teacher = teaching(args.guess, scene, args.tile) if args.guess else None
     if teacher:
         found = drawn_places(found, args.seed)
         code = np.zeros(len(found), np.int64)
     else:
-        code = in_blocks(found, args.seed, args.square, args.buffer) if by_blocks else shuffled(len(found), args.seed)
+        blocks = rule == "blocks"
+        code = in_blocks(found, args.seed, args.square, args.buffer) if blocks else shuffled(len(found), args.seed)
     annotated = outlines_on(scene, args.annotated) if args.annotated else None
     sections, buildings = None, np.zeros(0, object)
     if args.truth:
@@ -276,7 +277,8 @@ def main(argv: list[str] | None = None) -> None:
     for name in SPLITS:  # tiles of an earlier cut would be of another set now
         shutil.rmtree(args.out / name, ignore_errors=True)
     heights = []
-    for place, own in zip(found, code.tolist(), strict=True):
+    roofs = 0
+    for number, (place, own) in enumerate(zip(found, code.tolist(), strict=True)):
         if own == LEFT_OUT:
             continue
         window = place.window
@@ -287,9 +289,15 @@ def main(argv: list[str] | None = None) -> None:
             sample = building_sample(scene, buildings, window, unknown)
         else:
             sample = section_sample(scene, sections, window, unknown)
+        if teacher and (sample.roof == UNKNOWN).all():
+            code[number] = LEFT_OUT
+            continue
+        roofs += int((sample.roof == 1).sum())
         if own == 0:
             heights.append(sample.corner_heights)
         sample.save(args.out / SPLITS[own] / f"r{place.row:03d}c{place.col:03d}.npz")
+    if teacher and not roofs:
+        raise NothingToLearn(f"{args.guess} is sure of no roof in {args.raster}: give another model, or an annotation")
     if sections is not None:
         middle = shapely.get_coordinates(shapely.point_on_surface(shapely.force_2d(sections.seen)))
         write_truth(args.out / "truth.gpkg", sections, scene, codes_of(middle, found, code))
@@ -300,8 +308,8 @@ def main(argv: list[str] | None = None) -> None:
     record = {
         "raster": fingerprint.of_file(args.raster, args.out / "fingerprints.json"),
         "annotation": fingerprint.of_file(source, args.out / "fingerprints.json"),
-        "split": {"rule": args.split, "seed": args.seed, "shares": SHARES, "tile": args.tile, "tiles": counts}
-        | ({"square": args.square, "buffer": args.buffer} if by_blocks else {}),
+        "split": {"rule": rule, "seed": args.seed, "shares": SHARES, "tile": args.tile, "tiles": counts}
+        | ({"square": args.square, "buffer": args.buffer} if rule == "blocks" else {}),
         "gsd": args.gsd,
         "view": scene.view and [scene.view.azimuth, scene.view.elevation],
         "sun": scene.sun and [scene.sun.azimuth, scene.sun.elevation],

@@ -116,7 +116,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
             raise BadConfig(f"train.own: two data sets are called {name}: give one another name")
         own[name] = chosen
     teachers = [train["init"], *(item.get("guess") for item in train["own"] if not isinstance(item, str))]
-    if train["name"] in teachers:
+    if any(_same_set(teacher, str(train["name"]), base) for teacher in teachers if teacher):
         raise BadConfig(f"train: the set {train['name']} cannot be made from itself: give what is trained another name")
     if not own and not train["data"] and not train["tiles"]:
         raise BadConfig("train: nothing to learn from: give own, data or tiles")
@@ -133,16 +133,24 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     look, untold = {}, []
     if train["scene"]:
         scene = settings_of(train["scene"], "scene")
-        if scene.get("raster") is None:
-            raise BadConfig(f"train.scene: {train['scene']} has no raster to look like")
-        look[train["scene"]] = {k: scene[k] for k in ("raster", "bands", "aoi") if scene.get(k) is not None}
+        if scene.get("regions"):
+            raise BadConfig(
+                f"train.scene: {train['scene']} has regions: name a scene of one view, with its own aoi and angles"
+            )
+        for name in ("view", "sun"):
+            if sum(scene.get(f"{name}_{a}") is not None for a in PARTS) == 1:
+                raise BadConfig(f"train.scene: {train['scene']}: give {name}_azimuth and {name}_elevation, or neither")
+        if scene.get("raster") is not None:
+            look[train["scene"]] = {k: scene[k] for k in ("raster", "bands", "aoi") if scene.get(k) is not None}
+        elif scene.get("view_azimuth") is None:
+            raise BadConfig(f"train.scene: {train['scene']} has no raster to look like, and no view to simulate for")
         told = [name for name in ("view", "sun") if all(scene.get(f"{name}_{a}") is not None for a in PARTS)]
         untold = [name for name in ("view", "sun") if name not in told]
         options += [f"--{name}-{a}={scene[f'{name}_{a}']}" for name in told for a in PARTS]
         options += ["--untold", *untold] if untold else []
     exports = {"shared": SHARED, "separate": SEPARATE, "sections": ALONE}[train["networks"]]
     exports = SEPARATE if train["family"] == "maskrcnn" and exports is SHARED else exports
-    taken = {"corners": str(taking(train["init"], "corners", base))} if exports is ALONE else {}
+    taken = {"corners": str(taking(train["init"], "corners", train["gsd"], base))} if exports is ALONE else {}
     training = {}
     for network in exports:
         init = [f"--init={weights(train['init'], network, base)}"] if train["init"] else []
@@ -185,13 +193,29 @@ def like_model(init: str, task: str, base: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def taking(init: str | None, task: str, base: Path) -> Path:
-    """The model of another task that a set which is trained in part keeps from the one it started from. Raises `BadConfig`."""
+def _same_set(teacher: str, name: str, base: Path) -> bool:
+    """Whether a set, or a model in it, is the one to be made."""
+    folder = Path(teacher).parent if Path(teacher).is_file() else folder_of(teacher, base)
+    return teacher == name or folder.resolve() == (Path("models") / name).resolve()
+
+
+def taking(init: str | None, task: str, gsd: float | None, base: Path) -> Path:
+    """The model of another task that a set which is trained in part keeps from the one it started from, at its GSD (None: the
+    usual one). Raises `BadConfig`."""
     path = like_model(init, task, base) if init else None
     if path is None:
         raise BadConfig(
             f"train: networks: sections keeps the {task} of the set that `init` names: {init or 'it'} has no {task}.onnx; name "
             "one that has, or train both (networks: separate)"
+        )
+    from kibs_steps.learn.dataset import GSD
+    from kibs_steps.models import contract
+
+    own = contract.load(path, task).contract["gsd"]
+    if own != (gsd or GSD):
+        raise BadConfig(
+            f"train: {path} is for {own:g} m per px, the sections are to be for {gsd or GSD:g}: name a set for that in `init` "
+            "(research/gsd-0.25), or another gsd"
         )
     return path
 
@@ -205,16 +229,16 @@ def guessing(models: str, base: Path) -> Path:
 
 
 def weights(init: str, network: str, base: Path) -> Path:
-    """The weights to start from: a file, or of a model set its `NETWORK.pt`, `weights.pt` or only `.pt` file, or what the run of
-    that name has learned here."""
+    """The weights to start from: a file, or of a model set its `NETWORK.pt`, `weights.pt` or only `.pt` file, or what the run
+    that made it here has learned."""
     if Path(init).is_file():
         return Path(init)
     folder = folder_of(init, base)
     named = [folder / f"{network}.pt", folder / "weights.pt"]
     found = [f for f in named if f.is_file()] or sorted(folder.glob("*.pt"))
-    learned = Path("runs") / init / network / "checkpoint.pt"
-    if not found and learned.is_file():
-        return learned
+    run = Path("runs") / folder.name / network
+    if not found and (run / "done.json").is_file():
+        return run / "checkpoint.pt"
     if not found or (len(found) > 1 and found[0] not in named):
         apart = "" if network != "both" else " (a set with sections.pt and corners.pt needs networks: separate)"
         raise BadConfig(f"train.init: {init} is no file, and {folder} holds no {network}.pt or weights.pt{apart}")

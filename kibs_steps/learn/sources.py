@@ -28,6 +28,7 @@ SHARES = {"simulated": 0.62, "pasted": 0.23, "chips": 0.15, "own": 0.3}  # of th
 NON_COMMERCIAL = "CC BY-NC 4.0: trained on roof photographs under that licence, so not for commercial use"
 SHARE_ALIKE = "CC BY-SA 4.0: trained on SpaceNet-2 images under that licence"
 SIMULATED = "MIT, as the code: trained on simulated scenes only"
+AND = "; and "  # between the terms of a licence
 OWN = "as the owner of the training data decides"
 TALL_EVERY = 3  # one simulated tile in so many shows tall buildings
 DIRECTIONS = ("view", "sun")  # that networks are told, where they are known
@@ -160,7 +161,10 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
         dataset.simulated(np.random.default_rng([args.seed, HELD_OUT + i]), view=view, sun=sun, gsd=args.gsd)
         for i in range(args.validation)
     ]
-    validation = [prepared(as_seen(sample, args), size, upright) for sample in validation]
+    shown = windows_of(args)
+    validation = [
+        prepared(as_seen(sample, i, shown, args.untold), size, upright) for i, sample in enumerate(validation)
+    ]
     simulates = bool(args.tiles) or any(pool.glob("[!.]*.npz"))
     return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
 
@@ -171,18 +175,19 @@ def signature(args: argparse.Namespace) -> str:
     view, sun = _direction(args.view_azimuth, args.view_elevation), _direction(args.sun_azimuth, args.sun_elevation)
     init = fingerprint.of_source(args.init, Path(args.out) / "fingerprints.json") if args.init else None
     cities = sorted(Path(city).name for city in args.cities)
-    alike = [fingerprint.of_file(args.look, Path(args.out) / "fingerprints.json"), args.untold] if args.look else []
+    look = fingerprint.of_file(args.look, Path(args.out) / "fingerprints.json") if args.look else None
+    alike = [look, sorted(args.untold)] if args.look or args.untold else []
     return fingerprint.of_values(
         records, bool(args.data), args.free, sorted(args.leave_out), cities, view, sun, init, *alike
     )
 
 
-def as_seen(sample: Sample, args: argparse.Namespace) -> Sample:
-    """A validation sample as the scene to fine-tune for looks, told what is known of that."""
-    rng = np.random.default_rng(0)
-    if args.look:
-        sample = sample._replace(rgb=augmentation.likened(sample.rgb, windows_of(args)[0], rng))
-    return augmentation.without_geometry(sample, rng, tuple(float(name in args.untold) for name in DIRECTIONS))
+def as_seen(sample: Sample, number: int, shown: Sequence[np.ndarray], untold: Sequence[str]) -> Sample:
+    """The validation sample of a number as one of the windows of the scene to fine-tune for, told what is known of that."""
+    rng = np.random.default_rng([0, number])
+    if len(shown):
+        sample = sample._replace(rgb=augmentation.likened(sample.rgb, shown[number % len(shown)], rng))
+    return augmentation.without_geometry(sample, rng, tuple(float(name in untold) for name in DIRECTIONS))
 
 
 def prepared(sample: Sample, size: int, upright: bool) -> Sample:
@@ -201,19 +206,20 @@ def about(
     sun: tuple[float, float] | None,
 ) -> dict[str, Any]:
     """`trained_on` of the contract: data and licence of the sources used, angles, and heights of own corners."""
+    records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
     data = ["simulated scenes"] if simulates else []
     data += [f"simulated scenes of the city in {Path(city).name}" for city in args.cities]
     data += ["roof-graph photographs (Ren et al. 2021), pasted"] if graphs else []
     without = f", without {', '.join(args.leave_out)}" if args.leave_out else ""
     of = " of SpaceNet-2" if args.free else ""
     data += [f"chips with building masks{of}{without}"] if chips else []
-    data += [f"own samples: {Path(folder).name}" for folder in args.own]
+    guessed = (", guessed by a model" if "licence" in record else "" for record in records)
+    data += [f"own samples: {Path(folder).name}{by}" for folder, by in zip(args.own, guessed, strict=True)]
     data += [f"made to look like {Path(args.look).stem}"] if args.look else []
     bound = SHARE_ALIKE if args.free else NON_COMMERCIAL
-    records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
     licence = bound if graphs or chips else OWN if args.own else SIMULATED
-    teachers = [record["licence"] for record in records if record.get("licence", SIMULATED) != SIMULATED]
-    found: dict[str, Any] = {"data": data, "licence": "; and ".join(dict.fromkeys([licence, *teachers]))}
+    teachers = [record["licence"] for record in records if "licence" in record]
+    found: dict[str, Any] = {"data": data, "licence": together(licence, *teachers)}
     for name, direction in (("view", view), ("sun", sun)):
         # Simulated tiles show all directions unless one is asked for; own ones alone show theirs.
         shown = [direction] if simulates else [tuple(r[name]) if r[name] else None for r in records]
@@ -228,6 +234,12 @@ def about(
         variance = sum(r["count"] * (r["sigma"] ** 2 + (r["mean_height"] - mean) ** 2) for r in known) / count
         found["corner_heights"] = [mean, float(np.sqrt(variance))]
     return found
+
+
+def together(*licences: str) -> str:
+    """What binds who learns from data under all of these, each term once; simulated scenes bind nobody."""
+    terms = dict.fromkeys(term for licence in licences for term in licence.split(AND))
+    return AND.join(term for term in terms if term != SIMULATED) or SIMULATED
 
 
 def told(name: str, shown: list[tuple[float, float] | None]) -> dict[str, list[float] | None]:

@@ -115,12 +115,18 @@ def moved(batch: Any, device: torch.device) -> Any:
 
 
 def start_from(model: nn.Module, checkpoint: str | Path) -> None:
-    """Fills a network with the averaged weights of another run. Raises `ContractMismatch` where they are no numbers."""
-    average = torch.load(checkpoint, weights_only=True, map_location="cpu")["average"]
+    """Fills a network with the averaged weights of another run, those it exports (`averaged`). Raises `ContractMismatch` where
+    they are no numbers."""
+    average = averaged(torch.load(checkpoint, weights_only=True, map_location="cpu"))
     bad = [name for name, value in average.items() if not torch.isfinite(value).all()]
     if bad:
         raise ContractMismatch(f"{checkpoint}: {bad[0]} is not finite: start from other weights")
     model.load_state_dict(average)
+
+
+def averaged(state: dict[str, Any]) -> Batch:
+    """Of a checkpoint the averaged weights that count: those with the lowest loss on validation tiles, else the last ones."""
+    return (state.get("best") or {}).get("average") or state["average"]
 
 
 def learning_rate(used: float, top: float) -> float:

@@ -45,6 +45,16 @@ def test_windows_are_parts_of_the_raster_that_hold_data(tmp_path):
     assert again.read_bytes() == (tmp_path / "town.npy").read_bytes()
 
 
+def test_water_is_no_look(tmp_path):
+    rgb = np.random.default_rng(0).integers(1, 256, (256, 900, 3), dtype=np.uint8)
+    rgb[:, 500:] = (10, 30, 40)
+    raster(tmp_path / "coast.tif", rgb)
+    look.main([f"--raster={tmp_path / 'coast.tif'}", f"--out={tmp_path / 'coast.npy'}"])
+    found = np.load(tmp_path / "coast.npy")
+    assert 10 < len(found) < look.MOST
+    assert (found.std(axis=(1, 2)) > 15).all()
+
+
 def test_a_small_raster_is_one_window_and_an_empty_one_is_refused(tmp_path):
     raster(tmp_path / "small.tif", np.full((90, 120, 3), 80, np.uint8))
     look.main([f"--raster={tmp_path / 'small.tif'}", f"--out={tmp_path / 'small.npy'}"])

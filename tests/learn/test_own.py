@@ -135,6 +135,9 @@ def test_what_a_model_is_sure_of_stands_in_for_an_annotation(tmp_path):
             own.main([*words, f"--tile={tile}"])
     with pytest.raises(own.NothingToLearn, match=r"is for 0.38 m per px, the tiles are to be of 0.76"):
         own.main([*words, "--tile=40", "--gsd=0.76"])
+    toy.raster(tmp_path / "field.tif", np.full((90, 130, 3), (90, 110, 80), np.uint8))
+    with pytest.raises(own.NothingToLearn, match=r"sections.onnx is sure of no roof in .*field.tif"):
+        own.main([f"--raster={tmp_path / 'field.tif'}", *words[1:3], f"--out={tmp_path / 'none'}", "--tile=60"])
     assert len(own.drawn_places(own.places(900, 900, 60), 1, most=20)) == 20
 
 

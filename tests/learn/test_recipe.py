@@ -3,10 +3,16 @@
 import json
 
 import pytest
+import toy
 
 from kibs_steps.learn import recipe
 from kibs_steps.plan import BadConfig
 
+SCENES = {
+    "bare": {"dtm": 3},
+    "half": {"raster": "t.tif", "view_azimuth": 20.0},
+    "parts": {"raster": "t.tif", "regions": "r.gpkg"},
+}
 TOWN = {"raster": "t.tif", "dtm": 100, "truth": "t.gpkg", "view_azimuth": 181.1, "view_elevation": 59.3, "models": "x"}
 
 
@@ -33,7 +39,9 @@ def test_sections_may_be_trained_alone_and_corners_kept(tmp_path):
     train = {"networks": "sections", "init": "free"}
     with pytest.raises(BadConfig, match=r"free has no corners.onnx"):
         recipe.recipe({"train": train}, tmp_path)
-    (tmp_path / "models/free/corners.onnx").touch()
+    toy.corners_model(tmp_path / "models/free/corners.onnx")
+    with pytest.raises(BadConfig, match=r"is for 0.38 m per px, the sections are to be for 0.25"):
+        recipe.recipe({"train": {**train, "gsd": 0.25}}, tmp_path)
     found = recipe.recipe({"train": train}, tmp_path)
     assert (set(found.training), set(found.network_of)) == ({"sections"}, {"sections"})
     assert found.taken == {"corners": f"{tmp_path}/models/free/corners.onnx"}
@@ -124,14 +132,14 @@ def test_fine_tuning_for_an_image_of_unknown_view_shows_all_and_tells_none(tmp_p
 
 def test_a_set_that_was_trained_here_is_trained_on(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for file in ("models/mine/sections.onnx", "runs/mine/sections/checkpoint.pt"):
+    for file in ("models/mine/sections.onnx", "runs/mine/sections/done.json"):
         (tmp_path / file).parent.mkdir(parents=True)
         (tmp_path / file).touch()
     train = {"name": "again", "init": "mine", "networks": "separate"}
     with pytest.raises(BadConfig, match="corners"):
         recipe.recipe({"train": train}, tmp_path)
     (tmp_path / "runs/mine/corners").mkdir()
-    (tmp_path / "runs/mine/corners/checkpoint.pt").touch()
+    (tmp_path / "runs/mine/corners/done.json").touch()
     found = recipe.recipe({"train": train}, tmp_path)
     assert "--init=runs/mine/corners/checkpoint.pt" in found.training["corners"]
     assert found.export["sections"] == [f"--like={tmp_path}/models/mine/sections.onnx"]
@@ -191,11 +199,14 @@ def test_angles_may_come_from_metadata(tmp_path):
             "guesses nothing is: leave one out",
         ),
         ({"scene": "bare"}, "no raster to look like"),
+        ({"scene": "half"}, "view_azimuth and view_elevation, or neither"),
+        ({"scene": "parts"}, "name a scene of one view"),
         ({"init": "nothing"}, r"nothing is no file"),
         ({"tiles": 0}, "nothing to learn from"),
         ({"name": "a", "init": "a"}, "set a cannot be made from itself"),
+        ({"name": "a", "init": "models/a"}, "set a cannot be made from itself"),
     ],
 )
 def test_what_cannot_be_trained_is_said(tmp_path, train, message):
     with pytest.raises(BadConfig, match=message):
-        recipe.recipe({"scenes": {"bare": {"dtm": 3}}, "train": train}, tmp_path)
+        recipe.recipe({"scenes": SCENES, "train": train}, tmp_path)

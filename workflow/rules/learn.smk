@@ -113,6 +113,8 @@ rule taken:
     retries: 0
     conda:
         LEARN
+    params:
+        source=lambda w: RECIPE.taken[w.task],
     shell:
         "cp {input:q} {output:q} > {log:q} 2>&1"
 
@@ -120,7 +122,10 @@ rule taken:
 rule card:
     """The model card and the curves of a trained set."""
     input:
-        models=lambda w: [f"models/{w.name}/{task}.onnx" for task in RECIPE.network_of],
+        models=lambda w: [
+            f"models/{w.name}/{task}.onnx"
+            for task in [*RECIPE.network_of, *RECIPE.taken]
+        ],
         done=lambda w: [
             f"runs/{w.name}/{network}/done.json" for network in RECIPE.training
         ],
