@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -67,16 +68,18 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
     assert (tmp_path / "models/town/curves.png").stat().st_size > 1000
     assert json.loads((tmp_path / "runs/town/both/done.json").read_text())["steps"] == 20
 
-    # A set that goes on from this one and learns what it guesses makes nothing of it anew.
-    own = [{"scene": "known", "guess": "town"}]
+    # A set that goes on from this one, taught by another that lies beside it, makes nothing of either anew.
+    (tmp_path / "models/teacher").mkdir()
+    shutil.copy(ROOT / "models/free/sections.onnx", tmp_path / "models/teacher/sections.onnx")
+    own = [{"scene": "known", "guess": "teacher"}]
     more = {**train, "name": "again", "init": "town", "own": own, "steps": 2}
     (tmp_path / "more.yaml").write_text(json.dumps({"scenes": {"known": scene}, "train": more}))
-    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "models/town").iterdir()}
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "models").glob("*/*")}
     snakemake(tmp_path, "runs/again/both/done.json", "--configfile", "more.yaml")
-    assert made == {path: path.stat().st_mtime_ns for path in (tmp_path / "models/town").iterdir()}
+    assert made == {path: path.stat().st_mtime_ns for path in (tmp_path / "models").glob("*/*")}
     assert json.loads((tmp_path / "runs/again/both/done.json").read_text())["steps"] == 2
     licence = json.loads((tmp_path / "runs/again/own/known/own.json").read_text())["licence"]
-    assert "owner" in licence
+    assert "CC BY-SA 4.0" in licence
 
     other = {**scene, **{key: scene[key].replace("known", "new") for key in ("raster", "dtm", "truth")}}
     given = [f"{k}={v}" for k, v in {**other, "scene": "new", "models": "models/town", "method": "single"}.items()]
