@@ -6,6 +6,7 @@ In and out: samples. Directions, radiometry and the brightness of roofs vary; ge
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -139,6 +140,13 @@ def likened(rgb: np.ndarray, shown: np.ndarray, rng: np.random.Generator) -> np.
         had, wanted = (np.percentile(x[::2, ::2, band], PERCENTS) for x in (image, shown))
         image[..., band] = (1 - share) * values + share * np.interp(values, had, wanted)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def in_the_look(sample: Sample, shown: Sequence[np.ndarray], rng: np.random.Generator) -> Sample | None:
+    """The sample as one of the windows `shown` (n, s, s, 3) would show it, in the share LIKENED of samples; else None."""
+    if not len(shown) or rng.random() >= LIKENED:
+        return None
+    return sample._replace(rgb=likened(sample.rgb, shown[rng.integers(len(shown))], rng))
 
 
 def octaves(rgb: np.ndarray) -> list[np.ndarray]:

@@ -211,9 +211,9 @@ def _with_corners(sample: Sample, index: COCO | None, key: int | None) -> Sample
     if index is None or key is None:
         return sample._replace(corners_known=known)
     info = index.dataset.get("info", {})
-    told = info.get("bins") or {}
-    bins = paper_bins()._replace(**{key: told[key] for key in Bins._fields if key in told})
-    classed = set(Bins._fields) <= set(told)  # else nobody knows which class an exact height belongs to
+    written = info.get("bins") or {}
+    bins = paper_bins()._replace(**{key: written[key] for key in Bins._fields if key in written})
+    classed = set(Bins._fields) <= set(written)  # else nobody knows which class an exact height belongs to
     side = info.get("square", SQUARE)
     places, heights = [], []
     for annotation in sorted(index.imgToAnns[key], key=lambda a: a["id"]):
@@ -226,10 +226,10 @@ def _with_corners(sample: Sample, index: COCO | None, key: int | None) -> Sample
         moved = exact is None or np.abs(squares(np.array([exact]), known.shape, side)[0] - box).max() > UNMOVED
         places.append([x + width / 2, y + height / 2] if moved else exact)
         kind = annotation["category_id"] - 1
-        exact = np.array([annotation.get("height", np.nan)], float)  # None, null in the file, is NaN too
+        told = np.array([annotation.get("height", np.nan)], float)  # None, null in the file, is NaN too
         middle = bins.centres[kind] if 0 <= kind < len(bins.centres) else np.nan
-        same = bins.of(exact)[0] == kind if classed else np.isfinite(exact[0])
-        heights.append(exact[0] if same else middle)
+        same = bins.of(told)[0] == kind if classed else np.isfinite(told[0])
+        heights.append(told[0] if same else middle)
     return sample._replace(
         corners=np.array(places, np.float32).reshape(-1, 2),
         corner_heights=np.array(heights, np.float32),

@@ -283,9 +283,8 @@ class Mixture:
         sample = (
             augmentation.upright(sample, rng) if self.upright else augmentation.dihedral(sample, int(rng.integers(8)))
         )
-        if len(self.shown) and rng.random() < augmentation.LIKENED:
-            window = self.shown[rng.integers(len(self.shown))]
-            sample = sample._replace(rgb=augmentation.likened(sample.rgb, window, rng))
-        elif rng.random() >= augmentation.AS_IT_IS:
+        if (alike := augmentation.in_the_look(sample, self.shown, rng)) is not None:
+            return alike
+        if rng.random() >= augmentation.AS_IT_IS:
             sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
         return sample

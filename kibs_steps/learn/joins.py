@@ -134,7 +134,8 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
         chip = stock.chips[rng.integers(len(stock.chips))]
         ground = dataset.without_truth(dataset.chip_sample(chip, rng, contract["tile"], contract["gsd"]))
         sample = dataset.pasted_houses(ground, stock.graphs, rng, gsd=contract["gsd"])
-        return _likened(sample, stock.shown, rng) or sample
+        alike = augmentation.in_the_look(sample, stock.shown, rng)
+        return sample if alike is None else alike
     view, sun = (_direction(contract["trained_on"], name) for name in ("view", "sun"))
     sample = dataset.simulated(
         rng,
@@ -146,19 +147,12 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
         gsd=contract["gsd"],
         tall=number % sources.TALL_EVERY == sources.TALL_EVERY - 1,
     )
-    if alike := _likened(sample, stock.shown, rng):
+    if (alike := augmentation.in_the_look(sample, stock.shown, rng)) is not None:
         sample = alike
     elif rng.random() < VARIED:
         sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
     shares = tuple(1.0 if name in stock.untold else FORGOTTEN for name in sources.DIRECTIONS)
     return augmentation.without_geometry(sample, rng, shares)
-
-
-def _likened(sample: Sample, shown: Sequence[np.ndarray], rng: np.random.Generator) -> Sample | None:
-    """The sample as it would look in one of the windows, in their share of scenes; else None."""
-    if not len(shown) or rng.random() >= augmentation.LIKENED:
-        return None
-    return sample._replace(rgb=augmentation.likened(sample.rgb, shown[rng.integers(len(shown))], rng))
 
 
 def _direction(trained: dict[str, Any], name: str) -> tuple[float, float] | None:

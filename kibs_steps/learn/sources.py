@@ -140,6 +140,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     wanted = {**SHARES, **args.shares}
     if heights_needed:
         wanted |= {"pasted": 0.0, "chips": 0.0}
+    shown = windows_of(args)
     mixture = dataset.Mixture(
         pool,
         training,
@@ -151,7 +152,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
         upright,
         args.gsd,
         tuple(1.0 if name in args.untold else args.forget for name in DIRECTIONS),
-        windows_of(args),
+        shown,
     )
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
@@ -161,7 +162,6 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
         dataset.simulated(np.random.default_rng([args.seed, HELD_OUT + i]), view=view, sun=sun, gsd=args.gsd)
         for i in range(args.validation)
     ]
-    shown = windows_of(args)
     validation = [
         prepared(as_seen(sample, i, shown, args.untold), size, upright) for i, sample in enumerate(validation)
     ]
