@@ -222,6 +222,8 @@ def models_for(settings: dict[str, Any], base: Path) -> dict[str, contract.Model
     if len(found) > 1:
         simulated = settings.get("simulate")
         gsd = {**SIMULATED, **simulated}["gsd"] if simulated else own_gsd(settings.get("raster"))
+        if settings["suppose"]:  # something to tell is wanted
+            found = [one for one in found if not any(map(contract.untold, one.values()))] or found
         chosen = suite.choose(found, gsd, direction(settings, "view"), direction(settings, "sun"))
     else:
         (chosen,) = found
@@ -251,7 +253,7 @@ def supposes(settings: dict[str, Any], models: dict[str, contract.Model]) -> boo
     """Whether the networks are told directions that the image looks like: where the 2D model can say, and nobody else did."""
     unknown = None in (direction(settings, "view"), direction(settings, "sun")) and not settings.get("regions")
     terms = models["sections"].contract
-    can = terms["head"] == "dense" and bool(terms.get("geometry_input"))
+    can = terms["head"] == "dense" and bool(terms.get("geometry_input")) and not contract.untold(models["sections"])
     return bool(settings["suppose"]) and settings["feed"] == "models" and unknown and can
 
 

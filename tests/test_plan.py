@@ -64,6 +64,20 @@ def test_another_corner_model_leaves_sections_alone(files):
     }
 
 
+def test_supposing_takes_a_set_that_can_be_told(files):
+    folder, _ = files
+    common = {"data": ["toy"], "licence": "CC0-1.0"}
+    for place, trained in (("", common), ("untold", {**common, "untold": ["sun"]})):
+        toy.lit_sections_model(folder / "suite" / place / "sections.onnx", trained_on=trained)
+        toy.corners_model(folder / "suite" / place / "corners.onnx")
+    plain, supposing = (make(files, models=str(folder / "suite"), suppose=on) for on in (False, True))
+    assert plain.models["sections"].path.parent.name == "untold"
+    assert supposing.models["sections"].path.parent.name == "suite"
+    assert supposing.supposes
+    # Where nothing else is there, there is nobody to tell.
+    assert not make(files, models=str(folder / "suite/untold"), suppose=True).supposes
+
+
 def test_another_view_leaves_detection_alone(files):
     """The toy models take no geometry, so angles matter from the plane fit on (and for the truth's frames)."""
     found = changed(files, view_azimuth=90.0)

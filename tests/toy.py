@@ -131,7 +131,7 @@ def sections_model(path: Path, terms: dict | None = None) -> Path:
     return save(nodes, constants, outputs, path, contract("sections") if terms is None else terms)
 
 
-def lit_sections_model(path: Path) -> Path:
+def lit_sections_model(path: Path, **changes: object) -> Path:
     """The same roofs, seen the more surely the farther north (up) the shadow falls that it is told of."""
     nodes, constants, outputs = section_parts()
     n = helper.make_node
@@ -146,7 +146,7 @@ def lit_sections_model(path: Path) -> Path:
         n("Sigmoid", ["red0"], ["roof"]),
     ]
     constants |= {"i4": np.array([4], np.int64), "least": np.float32(0.02), "share": np.float32(0.01)}
-    return save(nodes, constants, outputs, path, contract("sections", geometry_input=True), geometry=True)
+    return save(nodes, constants, outputs, path, contract("sections", geometry_input=True, **changes), geometry=True)
 
 
 def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> Path:

@@ -89,7 +89,14 @@ def text(name: str, models: list[contracts.Model], runs: list[dict[str, Any]]) -
         for key in ("view_elevation", "view_azimuth", "sun_elevation", "sun_azimuth")
         if key in trained
     ]
-    lines += ["", "Angles: " + ("; ".join(ranges) or "not known") + ".", ""]
+    lines += ["", "Angles: " + ("; ".join(ranges) or "not known") + "."]
+    if kept := {name: m.path.name for m in models for name in contracts.untold(m)}:
+        network = next(iter(kept.values()))
+        lines += [
+            "",
+            f"`{network}` is told no {' and no '.join(kept)}: it was trained for images of which none is known.",
+        ]
+    lines.append("")
     metrics = next((m.contract["metrics"] for m in models if m.contract.get("metrics")), None)
     if metrics:
         lines += ["| test set | figures |", "|---|---|"]

@@ -48,8 +48,8 @@ ALONE = {"sections": ("sections",)}
 
 class Recipe(NamedTuple):
     """One `train`: the set's name, model by task -> network, models that are taken as they are by task, options of `learn.own` by
-    data, of `learn.look` by scene, of `learn.training` by network, and of `learn.export` and, where basins are joined,
-    `learn.joins` by task."""
+    data, of `learn.look` by scene, of `learn.training` by network and, where basins are joined, of `learn.joins` by task; the
+    weights that a network starts from, and the model that the one of a task is like (no file or one)."""
 
     name: str
     network_of: dict[str, str]
@@ -57,8 +57,9 @@ class Recipe(NamedTuple):
     own: dict[str, dict[str, Any]]
     look: dict[str, dict[str, Any]]
     training: dict[str, list[str]]
-    export: dict[str, list[str]]
     joins: dict[str, list[str]]
+    starts: dict[str, list[str]]
+    like: dict[str, list[str]]
 
     def files(self, own: str) -> list[str]:
         """The files of one own data set that are there."""
@@ -151,13 +152,13 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     exports = {"shared": SHARED, "separate": SEPARATE, "sections": ALONE}[train["networks"]]
     exports = SEPARATE if train["family"] == "maskrcnn" and exports is SHARED else exports
     taken = {"corners": str(taking(train["init"], "corners", train["gsd"], base))} if exports is ALONE else {}
-    training = {}
+    training, starts = {}, {}
     for network in exports:
-        init = [f"--init={weights(train['init'], network, base)}"] if train["init"] else []
-        training[network] = [*options, f"--task={network}", *init]
+        starts[network] = [str(weights(train["init"], network, base))] if train["init"] else []
+        training[network] = [*options, f"--task={network}"]
     network_of = {task: network for network, tasks in exports.items() for task in tasks}
-    like = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
-    export = {task: [f"--like={path}"] if path else [] for task, path in like.items()}
+    models = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
+    like = {task: [str(path)] if path else [] for task, path in models.items()}
     shown = [f"--scenes={train['joins']}"]
     shown += [f"--data={train['data']}"] if train["data"] and not train["free"] else []
     for key in ("cities", "leave_out"):
@@ -165,7 +166,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     shown += ["--untold", *untold] if untold else []
     joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
     joins = {task: shown if task in joining else [] for task in network_of}
-    return Recipe(str(train["name"]), network_of, taken, own, look, training, export, joins)
+    return Recipe(str(train["name"]), network_of, taken, own, look, training, joins, starts, like)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:

@@ -226,6 +226,8 @@ def about(
         if simulates and direction is None:
             continue
         found |= told(name, shown)
+    if args.untold:
+        found["untold"] = sorted(args.untold, key=DIRECTIONS.index)
     records = [record["corners"] for record in records]
     known = [record for record in records if record["count"]]
     if known:

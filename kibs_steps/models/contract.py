@@ -176,6 +176,11 @@ def agree(models: list[Model]) -> None:
             raise ContractMismatch(f"the models disagree on {field} ({files}): take two that were made together")
 
 
+def untold(model: Model) -> list[str]:
+    """The directions (`view`, `sun`) that a model was never told in training, and is to be told nowhere."""
+    return model.contract["trained_on"].get("untold", [])
+
+
 def beyond(value: float, allowed: list[float], circular: bool = False) -> float:
     """How far (deg) a value lies outside a range; azimuths wrap around (a range from 350 to 10 spans north)."""
     low, high = allowed

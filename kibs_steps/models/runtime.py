@@ -34,6 +34,7 @@ PROVIDERS: dict[str, tuple[str, str, dict[str, object]]] = {  # onnxruntime's na
     "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino", {"device_type": "CPU", "precision": "FP32"}),
 }
 
+TOLD = {"view": [0, 1, 4], "sun": [2, 3, 5]}  # columns of the geometry input
 DIRECTED = ("offset", "slope", "centre")  # maps whose two channels are a vector (col, row) of the image
 FULL = ("roof", "edge", "distance", "slope", "centre")  # maps that are needed at every pixel, whatever their stride
 
@@ -77,8 +78,8 @@ def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> C
 
     Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged; those
     that want tiles `upright` see the one view in which roofs lean up, where the lean is known and not zero.
-    The geometry goes to models whose contract asks for it. `provider` is a key of `PROVIDERS`; `threads` within an
-    operator. Raises `ProviderMissing`.
+    The geometry goes to models whose contract asks for it, but for what they were never told (`untold`). `provider` is a key of
+    `PROVIDERS`; `threads` within an operator. Raises `ProviderMissing`.
     """
     import onnxruntime as ort
 
@@ -111,6 +112,9 @@ def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> C
         return {name: at_pixels(name, value[0], len(rgb)) for name, value in outputs.items()} if dense else outputs
 
     def told(geometry: np.ndarray) -> Network:
+        geometry = geometry.copy()
+        for direction in contracts.untold(model):
+            geometry[:, TOLD[direction]] = 0
         if not dense:
             return lambda rgb: run(rgb, geometry)
         leans = bool(model.contract.get("upright")) and bool(geometry[0, :2].any())

@@ -49,17 +49,21 @@ def choose(found: list[Set], gsd: float | None, view: dict[str, float] | None, s
     """The set for a scene of `gsd` (m/px; None unknown) seen and lit from `view` and `sun` (azimuth, elevation deg, or None).
 
     The set whose models were trained nearest to the scene's angles, all that cover them being equally near; then the nearest
-    GSD that is not finer than the raster (else the coarsest); then the set of the narrowest range of views, the widest where the
-    view is unknown; then by path.
+    GSD that is not finer than the raster (else the coarsest); then the set that was told in training what is known of the scene
+    and no more, of its view first; then the set of the narrowest range of views, the widest where the view is unknown; then by
+    path.
     """
+    known = {"view": view is not None, "sun": sun is not None}
 
     def rank(one: Set) -> tuple:
         off = max(outside(model.contract["trained_on"], view, sun) for model in one.values())
         own = next(iter(one.values())).contract["gsd"]
         finer = gsd is not None and own < gsd * (1 - SAME_GSD)
+        untold = {name for model in one.values() for name in contracts.untold(model)}
+        unlike = [known[name] == (name in untold) for name in known]
         width = min(_view_range(model.contract["trained_on"]) for model in one.values())
         special = width if view is not None else -width  # an unknown view may be any
-        return round(off, 6), finer, -own if finer else own, special, str(next(iter(one.values())).path)
+        return round(off, 6), finer, -own if finer else own, unlike, special, str(next(iter(one.values())).path)
 
     return min(found, key=rank)
 

@@ -22,7 +22,8 @@ def test_defaults_train_the_dense_network_once_for_three_models(tmp_path):
     assert set(found.training) == {"both"}
     assert found.network_of == {"both": "both", "sections": "both", "corners": "both"}
     assert "--family=dense" in found.training["both"]
-    assert not [o for o in found.training["both"] if o.startswith(("--view", "--init", "--data"))]
+    assert not [o for o in found.training["both"] if o.startswith(("--view", "--data"))]
+    assert found.starts == {"both": []}
 
 
 @pytest.mark.parametrize("settings", [{"family": "maskrcnn"}, {"networks": "separate"}])
@@ -103,13 +104,14 @@ def test_fine_tuning_takes_the_scenes_angles_and_the_sets_weights(tmp_path):
         "train": {"scene": "town", "init": "free", "shares": {"simulated": 0.5, "own": 0.5}},
     }
     options = recipe.recipe(config, tmp_path).training["both"]
-    assert {"--view-azimuth=181.1", "--view-elevation=59.3", f"--init={folder / 'weights.pt'}"} <= set(options)
+    assert {"--view-azimuth=181.1", "--view-elevation=59.3"} <= set(options)
+    assert recipe.recipe(config, tmp_path).starts == {"both": [str(folder / "weights.pt")]}
     assert options[options.index("--untold") + 1] == "sun"
     assert recipe.recipe(config, tmp_path).look == {"town": {"raster": "t.tif"}}
     assert "--shares=simulated=0.5,own=0.5" in options
-    assert recipe.recipe(config, tmp_path).export == {"both": [], "sections": [], "corners": []}
+    assert recipe.recipe(config, tmp_path).like == {"both": [], "sections": [], "corners": []}
     (folder / "sections.onnx").touch()
-    assert recipe.recipe(config, tmp_path).export["sections"] == [f"--like={folder / 'sections.onnx'}"]
+    assert recipe.recipe(config, tmp_path).like["sections"] == [str(folder / "sections.onnx")]
     (folder / "both.pt").touch()
     assert recipe.weights("free", "both", tmp_path) == folder / "both.pt"
     assert recipe.weights(str(folder / "weights.pt"), "both", tmp_path) == folder / "weights.pt"
@@ -141,8 +143,8 @@ def test_a_set_that_was_trained_here_is_trained_on(tmp_path, monkeypatch):
     (tmp_path / "runs/mine/corners").mkdir()
     (tmp_path / "runs/mine/corners/done.json").touch()
     found = recipe.recipe({"train": train}, tmp_path)
-    assert "--init=runs/mine/corners/checkpoint.pt" in found.training["corners"]
-    assert found.export["sections"] == [f"--like={tmp_path}/models/mine/sections.onnx"]
+    assert found.starts["corners"] == ["runs/mine/corners/checkpoint.pt"]
+    assert found.like["sections"] == [f"{tmp_path}/models/mine/sections.onnx"]
 
 
 def test_a_scene_nobody_annotated_is_guessed_by_a_model(tmp_path):

@@ -83,6 +83,7 @@ def test_tiles_look_like_the_scene_to_fine_tune_for_and_are_told_what_is_known_o
     assert not any(tile.geometry[4] for tile in tiles)
     assert found.validation[0].rgb.min() >= 90
     assert "made to look like far" in found.about["data"]
+    assert found.about["untold"] == ["view"]
     plain = arguments(*words[:3], f"--out={tmp_path}/run/both")
     alike = arguments(*words, f"--out={tmp_path}/run/both")
     assert sources.signature(plain) != sources.signature(alike)

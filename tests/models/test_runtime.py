@@ -5,6 +5,7 @@ import pytest
 import toy
 from hypothesis import given
 from hypothesis import strategies as st
+from onnx import helper
 
 from kibs_steps.models import contract, heads, runtime
 from kibs_steps.models.runtime import Flip
@@ -49,6 +50,36 @@ def test_flips_leave_a_symmetric_network_alone(tmp_path):
         found.append(heads.decode_corners(runtime.open_network(model, geometry)(image), model.contract))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("untold", "kept"),
+    [
+        ([], [1, 2, 3, 4, 1, 1]),
+        (["view"], [0, 0, 3, 4, 0, 1]),
+        (["sun"], [1, 2, 0, 0, 1, 0]),
+        (["view", "sun"], [0] * 6),
+    ],
+)
+def test_what_a_model_was_never_told_is_kept_from_it(tmp_path, untold, kept):
+    """A network that answers with what it was told."""
+    ones = np.ones((1, 6, toy.TILE, toy.TILE), np.float32)
+    nodes = [
+        helper.make_node("Reshape", ["geometry", "shape"], ["column"]),
+        helper.make_node("Mul", ["column", "ones"], ["roof"]),
+    ]
+    terms = toy.contract(
+        "sections", geometry_input=True, trained_on={"data": [], "licence": "CC0-1.0", "untold": untold}
+    )
+    constants = {"shape": np.array([1, 6, 1, 1]), "ones": ones}
+    path = toy.save(
+        nodes, constants, {"roof": [1, 6, toy.TILE, toy.TILE]}, tmp_path / "echo.onnx", terms, geometry=True
+    )
+    geometry = np.array([[1, 2, 3, 4, 1, 1]], np.float32)
+    model = contract.Model(path, "", terms)
+    found = runtime.open_network(model, geometry)(np.zeros((toy.TILE, toy.TILE, 3), np.uint8))["roof"][:, 0, 0]
+    assert found.tolist() == kept
+    assert geometry.tolist() == [[1, 2, 3, 4, 1, 1]]
 
 
 def test_maps_of_any_stride_are_brought_to_pixels():

@@ -91,6 +91,18 @@ def test_the_more_special_of_two_that_cover(tmp_path):
     assert chosen(tmp_path, 0.38).stem == "sections-all"  # seen from nobody knows where
 
 
+def test_a_scene_gets_the_set_that_was_told_what_is_known_of_it(tmp_path):
+    add(tmp_path, "-told")
+    add(tmp_path, "-sun", untold=["view"])
+    add(tmp_path, "-none", untold=["view", "sun"])
+    assert chosen(tmp_path, 0.38).stem == "sections-none"
+    assert chosen(tmp_path, 0.38, None, (150, 40)).stem == "sections-sun"
+    assert chosen(tmp_path, 0.38, (181, 60), (150, 40)).stem == "sections-told"
+    assert chosen(tmp_path, 0.38, (181, 60)).stem == "sections-told"
+    add(tmp_path, "-fine", gsd=0.25)
+    assert chosen(tmp_path, 0.25).stem == "sections-fine"  # the GSD comes first
+
+
 def test_a_single_set_and_none(tmp_path):
     with pytest.raises(contract.NotAModel, match="no model at"):
         suite.sets(tmp_path / "nowhere", PAIR)

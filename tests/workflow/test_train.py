@@ -25,19 +25,25 @@ ROOT = Path(__file__).parents[2]
 ANGLES = {"view_azimuth": 120.0, "view_elevation": 65.0, "sun_azimuth": 155.0, "sun_elevation": 45.0}
 
 
-def snakemake(folder: Path, *words: str) -> str:
-    done = subprocess.run(
+def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
         [sys.executable, "-m", "snakemake", "-s", str(ROOT / "Snakefile"), "--cores", "1", *words],
         cwd=folder,
         capture_output=True,
         text=True,
     )
+
+
+def snakemake(folder: Path, *words: str) -> str:
+    done = run(folder, *words)
     logs = "".join(f"{p}:\n{p.read_text()}" for p in folder.glob("runs/*/logs/*.log"))
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:] + logs[-3000:]
     return done.stdout + done.stderr
 
 
 def test_train_on_own_data_then_build_another_raster(tmp_path):
+    import torch
+
     for name, seed in (("known", 3), ("new", 4)):
         angles = [f"--{k.replace('_', '-')}={v}" for k, v in ANGLES.items()]
         size = [f"--seed={seed}", "--size=340", "--style=suburb", f"--out={tmp_path / name}"]
@@ -80,6 +86,12 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
     assert json.loads((tmp_path / "runs/again/both/done.json").read_text())["steps"] == 2
     licence = json.loads((tmp_path / "runs/again/own/known/own.json").read_text())["licence"]
     assert "CC BY-SA 4.0" in licence
+    # Trained anew, the set it started from is another: what was made from the old one does not pass for new.
+    first = tmp_path / "runs/town/both/checkpoint.pt"
+    torch.save({**torch.load(first, weights_only=True), "step": 21}, first)
+    assert run(tmp_path, "runs/again/both/done.json", "--configfile", "more.yaml").returncode != 0
+    assert "started from other weights" in (tmp_path / "runs/again/logs/training_both.log").read_text()
+    assert (tmp_path / "runs/again/both/checkpoint.pt").is_file()
 
     other = {**scene, **{key: scene[key].replace("known", "new") for key in ("raster", "dtm", "truth")}}
     given = [f"{k}={v}" for k, v in {**other, "scene": "new", "models": "models/town", "method": "single"}.items()]
@@ -88,22 +100,7 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
     assert {"roof_sections", "buildings"} <= {
         name for name, _ in pyogrio.list_layers(tmp_path / "results/new/city.gpkg")
     }
-    refused = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "snakemake",
-            "-s",
-            str(ROOT / "Snakefile"),
-            "-n",
-            "--config",
-            *given,
-            "view_elevation=80",
-        ],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+    refused = run(tmp_path, "-n", "--config", *given, "view_elevation=80")
     assert refused.returncode != 0
     assert "outside what it was trained on" in refused.stdout + refused.stderr
 

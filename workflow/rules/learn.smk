@@ -57,6 +57,7 @@ rule trained:
     input:
         own=[f"runs/{RECIPE.name}/own/{own}/own.json" for own in RECIPE.own],
         look=[f"runs/{RECIPE.name}/look/{scene}.npy" for scene in RECIPE.look],
+        init=lambda w: RECIPE.starts[w.network],
     output:
         "runs/{name}/{network}/done.json",
     log:
@@ -69,8 +70,9 @@ rule trained:
         options=lambda w: RECIPE.training[w.network],
         own=lambda w: [f"runs/{w.name}/own/{own}" for own in RECIPE.own],
         look=lambda w, input: ["--look", *input.look] if input.look else [],
+        init=lambda w, input: ["--init", *input.init] if input.init else [],
     shell:
-        "python -m kibs_steps.learn.training {params.options:q} {params.look:q} --own {params.own:q} --threads {threads}"
+        "python -m kibs_steps.learn.training {params.options:q} {params.look:q} {params.init:q} --own {params.own:q} --threads {threads}"
         " --pool runs/{wildcards.name:q}/pool --out $(dirname {output:q}) > {log:q} 2>&1"
 
 
@@ -79,6 +81,7 @@ rule exported:
     input:
         done=lambda w: f"runs/{w.name}/{RECIPE.network_of[w.task]}/done.json",
         look=[f"runs/{RECIPE.name}/look/{scene}.npy" for scene in RECIPE.look],
+        like=lambda w: RECIPE.like[w.task],
     output:
         "models/{name}/{task}.onnx",
     log:
@@ -89,12 +92,12 @@ rule exported:
     conda:
         LEARN
     params:
-        options=lambda w: RECIPE.export[w.task],
+        like=lambda w, input: ["--like", *input.like] if input.like else [],
         joins=lambda w: RECIPE.joins[w.task],
         learns=lambda w: "yes" if RECIPE.joins[w.task] else "no",
         look=lambda w, input: ["--look", *input.look] if input.look else [],
     shell:
-        "python -m kibs_steps.learn.export {params.options:q} --checkpoint $(dirname {input.done:q})/checkpoint.pt"
+        "python -m kibs_steps.learn.export {params.like:q} --checkpoint $(dirname {input.done:q})/checkpoint.pt"
         " --task {wildcards.task} --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
         " && (test {params.learns} = no"
         " || python -m kibs_steps.learn.joins --model {output:q} {params.joins:q} {params.look:q} >> {log:q} 2>&1)"
