@@ -48,6 +48,7 @@ def test_passes_of_a_model():
     assert rivals.passes({}) == 1
     assert rivals.passes({"flips": 8}) == 8
     assert rivals.passes({"flips": 8, "upright": True}) == 1
+    assert rivals.passes({"flips": 8, "upright": True, "mirrored": True}) == 2
 
 
 def test_no_patch_shows_the_scene_of_a_neighbour():

@@ -20,7 +20,8 @@ import numpy as np
 
 def passes(contract: dict[str, Any]) -> int:
     """How often a model is run on every tile."""
-    return 1 if contract.get("upright") else contract.get("flips", 1)
+    upright = 2 if contract.get("mirrored") else 1
+    return upright if contract.get("upright") else contract.get("flips", 1)
 
 
 def _bare(path: str, tiles: int, seed: int) -> float:

@@ -55,11 +55,13 @@ def dihedral(sample: Sample, k: int) -> Sample:
 
 
 def upright(sample: Sample, rng: np.random.Generator) -> Sample:
-    """The sample as the network sees tiles (`runtime.upright`): roofs lean up. Where nothing leans, any of its eight views."""
+    """The sample as a mirrored network sees tiles (`runtime.shown`): one of its views in which roofs lean up, any of the eight
+    where they do not lean."""
     turn = int(rng.integers(8))
-    if not sample.geometry[:2].any():
+    if not runtime.leans(sample.geometry):
         return dihedral(sample, turn)
-    return next(s for s in (dihedral(sample, k) for k in range(8)) if runtime.leans_up(*s.geometry[:2]))
+    up = next(s for s in (dihedral(sample, k) for k in range(8)) if runtime.leans_up(*s.geometry[:2]))
+    return dihedral(up, 4) if turn % 2 else up
 
 
 def without_geometry(

@@ -82,6 +82,7 @@ def contract_of(
         "input": {"channels": "RGB", "scale": 1.0, "mean": [127.0] * 3, "std": [128.0] * 3},
         "geometry_input": True,
         "upright": True,
+        "mirrored": True,
         "flips": 8,  # where nothing leans, or nobody knows how
         "thresholds": {**thresholds_of(task, gsd), **facts.get("thresholds", {})},
         "trained_on": {
@@ -101,7 +102,8 @@ def contract_of(
     contract["trained_on"] = {key: value for key, value in trained.items() if value is not None}
     contract["trained_on"].update({k: facts[k] for k in ("seed", "commit") if k in facts})
     if family == "maskrcnn":
-        del contract["geometry_input"], contract["upright"], contract["flips"]
+        for term in ("geometry_input", "upright", "mirrored", "flips"):
+            del contract[term]
         contract.update(maskrcnn.contract_terms(task, heights or (6.0, 4.0)))
         contract["thresholds"].update(facts.get("thresholds", {}))
     elif task == "corners":

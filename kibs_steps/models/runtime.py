@@ -10,7 +10,7 @@ import argparse
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,7 @@ PROVIDERS: dict[str, tuple[str, str, dict[str, object]]] = {  # onnxruntime's na
     "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino", {"device_type": "CPU", "precision": "FP32"}),
 }
 
+LEANING = 0.25  # px per metre of height: what leans less is seen from above
 TOLD = {"view": [0, 1, 4], "sun": [2, 3, 5]}  # columns of the geometry input
 DIRECTED = ("offset", "slope", "centre")  # maps whose two channels are a vector (col, row) of the image
 FULL = ("roof", "edge", "distance", "slope", "centre")  # maps that are needed at every pixel, whatever their stride
@@ -76,8 +77,7 @@ def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> C
     """A session of a model: for a geometry (1, 6) a function from an image (s, s, 3) uint8 to the model's named outputs without
     their batch axis.
 
-    Dense models whose contract asks for `flips` are run on so many symmetric views of the tile, and their maps averaged; those
-    that want tiles `upright` see the one view in which roofs lean up, where the lean is known and not zero.
+    Dense models are run on the symmetric views of the tile that `shown` gives, and their maps averaged.
     The geometry goes to models whose contract asks for it, but for what they were never told (`untold`). `provider` is a key of
     `PROVIDERS`; `threads` within an operator. Raises `ProviderMissing`.
     """
@@ -117,8 +117,7 @@ def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> C
             geometry[:, TOLD[direction]] = 0
         if not dense:
             return lambda rgb: run(rgb, geometry)
-        leans = bool(model.contract.get("upright")) and bool(geometry[0, :2].any())
-        views = [upright(geometry)] if leans else FLIPS[: model.contract.get("flips", 1)]
+        views = shown(model.contract, geometry)
 
         def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
             total: dict[str, np.ndarray] = {}
@@ -168,6 +167,10 @@ class Flip(NamedTuple):
         vector[0, [1, 3]] *= -1 if self.rows else 1
         return vector
 
+    def mirrored(self) -> Flip:
+        """The same with left and right of what is seen exchanged."""
+        return self._replace(columns=not self.columns)
+
     def back(self, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Maps (C, s, s) of the flipped image as maps of the image itself; those of `DIRECTED` (col, row) turn with it."""
         out = {}
@@ -196,6 +199,23 @@ def upright(geometry: np.ndarray) -> Flip:
     Where the view's lean is zero or unknown the tile stays as it is.
     """
     return next((flip for flip in FLIPS if leans_up(*flip.geometry(geometry)[0, :2])), FLIPS[0])
+
+
+def leans(geometry: np.ndarray) -> bool:
+    """Whether roofs lean visibly in an image of a geometry (6,)."""
+    return bool(np.hypot(*geometry[:2]) >= LEANING)
+
+
+def shown(contract: dict[str, Any], geometry: np.ndarray) -> list[Flip]:
+    """The symmetric views in which a dense model sees a tile of a geometry (1, 6).
+
+    As many as its `flips`; models that want tiles `upright` see, where roofs lean visibly, the one in which they lean up, and if
+    they are `mirrored` that with left and right exchanged too.
+    """
+    first = upright(geometry) if contract.get("upright") else FLIPS[0]
+    if contract.get("upright") and leans(geometry[0]):
+        return [first, first.mirrored()] if contract.get("mirrored") else [first]
+    return [first, *(flip for flip in FLIPS if flip != first)][: contract.get("flips", 1)]
 
 
 def from_record(path: str | Path, task: str) -> contracts.Model:

@@ -12,6 +12,7 @@ import pytest
 from kibs_steps import photographs
 from kibs_steps.learn import augmentation, dataset
 from kibs_steps.learn.samples import UNKNOWN, Sample
+from kibs_steps.models import runtime
 
 
 @pytest.fixture
@@ -39,6 +40,23 @@ def test_dihedral_moves_corners_labels_and_vectors_with_the_image(marked, k):
     assert (turned.rgb[row, col] == 128).all()
     assert (turned.labels == 1).sum() == (marked.labels == 1).sum()
     assert turned.geometry[4:].tolist() == [1, 1]
+
+
+def test_tiles_are_trained_as_networks_see_them(marked):
+    """Both views with roofs leaning up, and all eight from above: those in which `runtime.shown` shows a tile."""
+    terms = {"upright": True, "mirrored": True, "flips": 8}
+    rng = np.random.default_rng(0)
+    for vector in ((-7, 3), (0.1, -0.05), (0, 0)):
+        sample = marked._replace(geometry=np.float32([*vector, 1, 2, 1, 1]))
+        shown = {
+            flip.geometry(sample.geometry[None])[0, :4].tobytes()
+            for flip in runtime.shown(terms, sample.geometry[None])
+        }
+        tiles = [augmentation.upright(sample, rng) for _ in range(80)]
+        assert {tile.geometry[:4].tobytes() for tile in tiles} == shown
+        for tile in tiles:
+            col, row = np.floor(tile.corners[0]).astype(int)
+            assert (tile.rgb[row, col] == 255).all()
 
 
 def test_window_keeps_only_its_corners(marked):

@@ -137,3 +137,18 @@ def test_upright_is_the_one_symmetry_in_which_roofs_lean_up():
         assert row <= 0 <= -col <= -row
         assert np.hypot(col, row) == pytest.approx(np.hypot(*vector), rel=1e-6)
     assert runtime.upright(np.zeros((1, 6), np.float32)) == runtime.FLIPS[0]
+
+
+def test_the_views_in_which_a_tile_is_seen():
+    """Leaning roofs: up, and mirrored if the model was trained so; from above: as many as the model's `flips`."""
+    geometry = runtime.geometry_vector(lean(250, 62), lean(155, 45), 0.38)
+    (up,) = runtime.shown({"upright": True, "flips": 8}, geometry)
+    both = runtime.shown({"upright": True, "flips": 8, "mirrored": True}, geometry)
+    assert both[0] == up
+    (col, row), (other, same) = (flip.geometry(geometry)[0, :2] for flip in both)
+    assert (other, same) == (-col, row)
+    assert row < 0
+    for steep in (runtime.geometry_vector(lean(250, 86), None, 0.38), runtime.geometry_vector(None, None, 0.38)):
+        for terms in ({"upright": True, "flips": 8, "mirrored": True}, {"flips": 8}):
+            assert sorted(runtime.shown(terms, steep)) == sorted(runtime.FLIPS)
+        assert runtime.shown({"upright": True}, steep) == [runtime.upright(steep)]
