@@ -7,6 +7,7 @@ fine-tuned for: tiles are simulated at its angles (also those that `metadata` te
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ DEFAULTS = {
     "joins": 120,
     "patience": 10,
     "shares": None,
+    "thresholds": {},
     "device": "cpu",
 }
 PARTS = ("azimuth", "elevation")
@@ -48,8 +50,8 @@ ALONE = {"sections": ("sections",)}
 
 class Recipe(NamedTuple):
     """One `train`: the set's name, model by task -> network, models that are taken as they are by task, options of `learn.own` by
-    data, of `learn.look` by scene, of `learn.training` by network and, where basins are joined, of `learn.joins` by task; the
-    weights that a network starts from, and the model that the one of a task is like (no file or one)."""
+    data, of `learn.look` by scene, of `learn.training` by network, of `learn.export` by task, there of `learn.joins` too where
+    basins are joined; the weights that a network starts from, and the model that the one of a task is like (no file or one)."""
 
     name: str
     network_of: dict[str, str]
@@ -57,6 +59,7 @@ class Recipe(NamedTuple):
     own: dict[str, dict[str, Any]]
     look: dict[str, dict[str, Any]]
     training: dict[str, list[str]]
+    export: dict[str, list[str]]
     joins: dict[str, list[str]]
     starts: dict[str, list[str]]
     like: dict[str, list[str]]
@@ -159,6 +162,8 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     network_of = {task: network for network, tasks in exports.items() for task in tasks}
     models = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
     like = {task: [str(path)] if path else [] for task, path in models.items()}
+    thresholds = [f"--thresholds={json.dumps(train['thresholds'])}"] if train["thresholds"] else []
+    export = {task: thresholds if task != "corners" else [] for task in network_of}
     shown = [f"--scenes={train['joins']}"]
     shown += [f"--data={train['data']}"] if train["data"] and not train["free"] else []
     for key in ("cities", "leave_out"):
@@ -166,7 +171,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     shown += ["--untold", *untold] if untold else []
     joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
     joins = {task: shown if task in joining else [] for task in network_of}
-    return Recipe(str(train["name"]), network_of, taken, own, look, training, joins, starts, like)
+    return Recipe(str(train["name"]), network_of, taken, own, look, training, export, joins, starts, like)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:

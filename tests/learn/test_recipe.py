@@ -70,6 +70,14 @@ def test_joins_are_learned_for_networks_that_find_basins(tmp_path):
     assert "--data=kibs" not in recipe.recipe({"train": {**given, "free": True}}, tmp_path).joins["both"]
 
 
+def test_thresholds_are_those_of_the_model_for_sections(tmp_path):
+    given = {"train": {"thresholds": {"likely": 0.15, "surer": 0.7}}}
+    export = recipe.recipe(given, tmp_path).export
+    assert export["sections"] == export["both"] == ['--thresholds={"likely": 0.15, "surer": 0.7}']
+    assert export["corners"] == []
+    assert recipe.recipe({}, tmp_path).export == {"both": [], "sections": [], "corners": []}
+
+
 def test_free_sources_are_asked_for(tmp_path):
     assert "--free" in recipe.recipe({"train": {"data": "kibs", "free": True}}, tmp_path).training["both"]
     assert "--free" not in recipe.recipe({"train": {"data": "kibs"}}, tmp_path).training["both"]

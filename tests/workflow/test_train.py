@@ -50,7 +50,7 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
         simulation.main([*size, *angles])
     scene = {"raster": "known/scene.tif", "dtm": "known/dtm.tif", "truth": "known/truth.gpkg", **ANGLES}
     train = {"name": "town", "own": ["known"], "split": "shuffle", "tiles": 0, "steps": 20, "minutes": 30, "joins": 2}
-    train["scene"] = "known"
+    train |= {"scene": "known", "thresholds": {"surer": 0.7}}
     # A scene's models are looked for when Snakemake starts, so the configuration of training names the shipped ones.
     (tmp_path / "config.yaml").write_text(json.dumps({"scenes": {"known": scene}, "train": train}))
     snakemake(tmp_path, "train")
@@ -65,6 +65,7 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
     for task in ("sections", "corners", "both"):
         made = contract.load(tmp_path / "models/town" / f"{task}.onnx", task)
         trained = made.contract["trained_on"]
+        assert made.contract["thresholds"].get("surer") == (0.7 if task != "corners" else None)
         assert trained["data"] == ["own samples: known", "made to look like known"]
         assert trained["view_elevation"] == [62.0, 68.0]
         assert "owner" in trained["licence"]

@@ -92,12 +92,13 @@ rule exported:
     conda:
         LEARN
     params:
+        options=lambda w: RECIPE.export[w.task],
         like=lambda w, input: ["--like", *input.like] if input.like else [],
         joins=lambda w: RECIPE.joins[w.task],
         learns=lambda w: "yes" if RECIPE.joins[w.task] else "no",
         look=lambda w, input: ["--look", *input.look] if input.look else [],
     shell:
-        "python -m kibs_steps.learn.export {params.like:q} --checkpoint $(dirname {input.done:q})/checkpoint.pt"
+        "python -m kibs_steps.learn.export {params.options:q} {params.like:q} --checkpoint $(dirname {input.done:q})/checkpoint.pt"
         " --task {wildcards.task} --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
         " && (test {params.learns} = no"
         " || python -m kibs_steps.learn.joins --model {output:q} {params.joins:q} {params.look:q} >> {log:q} 2>&1)"
