@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import shutil
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -216,8 +216,39 @@ def write_truth(path: Path, sections: Truth, scene: Scene, split: NDArray[np.int
         pyogrio.write_dataframe(frame, temporary, layer="sections_map", driver="GPKG", geometry_type="Polygon Z")
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Make training samples of a raster and its annotation."""
+def record_of(
+    args: argparse.Namespace,
+    scene: Scene,
+    rule: str,
+    code: NDArray[np.int64],
+    heights: list[NDArray[np.float32]],
+    teacher: Teacher | None,
+) -> dict[str, Any]:
+    """`own.json`: what the samples were made of, their split by `rule` and `code` (one of each tile), angles, and the moments of
+    the training corners' `heights` (m; of each tile)."""
+    known = np.concatenate([*heights, np.zeros(0, np.float32)])
+    known = known[np.isfinite(known)]
+    counts = {name: int((code == i).sum()) for i, name in enumerate(SPLITS)} | {"left_out": int((code < 0).sum())}
+    source = args.truth or args.buildings or args.guess
+    record = {
+        "raster": fingerprint.of_file(args.raster, args.out / "fingerprints.json"),
+        "annotation": fingerprint.of_file(source, args.out / "fingerprints.json"),
+        "split": {"rule": rule, "seed": args.seed, "shares": SHARES, "tile": args.tile, "tiles": counts}
+        | ({"square": args.square, "buffer": args.buffer} if rule == "blocks" else {}),
+        "gsd": args.gsd,
+        "view": scene.view and [scene.view.azimuth, scene.view.elevation],
+        "sun": scene.sun and [scene.sun.azimuth, scene.sun.elevation],
+        "corners": {
+            "count": len(known),
+            "mean_height": float(known.mean()) if len(known) else None,
+            "sigma": float(known.std()) if len(known) else None,
+        },
+    }
+    return {**record, "licence": teacher.licence} if teacher else record
+
+
+def _arguments(argv: list[str] | None) -> argparse.Namespace:
+    """The options of `main`."""
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.own", description=main.__doc__)
     parser.add_argument("--raster", required=True)
     parser.add_argument("--dtm", required=True, help="terrain: a file, or one height in m")
@@ -244,6 +275,12 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     if args.guess and args.annotated:
         parser.error("--annotated goes with --truth or --buildings: of what a model guesses nothing is annotated")
+    return args
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Make training samples of a raster and its annotation."""
+    args = _arguments(argv)
     dtm = float(args.dtm) if _is_number(args.dtm) else args.dtm
     scene = scenes.build(
         args.out.name,
@@ -301,27 +338,9 @@ def main(argv: list[str] | None = None) -> None:
     if sections is not None:
         middle = shapely.get_coordinates(shapely.point_on_surface(shapely.force_2d(sections.seen)))
         write_truth(args.out / "truth.gpkg", sections, scene, codes_of(middle, found, code))
-    known = np.concatenate([*heights, np.zeros(0, np.float32)])
-    known = known[np.isfinite(known)]
-    counts = {name: int((code == i).sum()) for i, name in enumerate(SPLITS)} | {"left_out": int((code < 0).sum())}
-    source = args.truth or args.buildings or args.guess
-    record = {
-        "raster": fingerprint.of_file(args.raster, args.out / "fingerprints.json"),
-        "annotation": fingerprint.of_file(source, args.out / "fingerprints.json"),
-        "split": {"rule": rule, "seed": args.seed, "shares": SHARES, "tile": args.tile, "tiles": counts}
-        | ({"square": args.square, "buffer": args.buffer} if rule == "blocks" else {}),
-        "gsd": args.gsd,
-        "view": scene.view and [scene.view.azimuth, scene.view.elevation],
-        "sun": scene.sun and [scene.sun.azimuth, scene.sun.elevation],
-        "corners": {
-            "count": len(known),
-            "mean_height": float(known.mean()) if len(known) else None,
-            "sigma": float(known.std()) if len(known) else None,
-        },
-    }
-    if teacher:
-        record["licence"] = teacher.licence
+    record = record_of(args, scene, rule, code, heights, teacher)
     store.write_json(args.out / "own.json", record, summed=False)
+    counts = record["split"]["tiles"]
     print(f"{args.out}: {', '.join(f'{n} {name}' for name, n in counts.items())} tiles")
 
 
