@@ -91,7 +91,8 @@ def main(argv: list[str] | None = None) -> None:
     labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
     images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
-    network = runtime.open_network(model, supposed.told(facts, core, args.supposed), args.provider, args.threads)
+    geometry = supposed.told(facts, core, args.supposed)
+    network = runtime.open_network(model, geometry, args.provider, args.threads, args.looks)
     tables, heights = [CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile in tiles:
         place = tile.row, tile.col

@@ -36,6 +36,7 @@ DEFAULTS = {
     "allow_angles": False,
     "provider": "cpu",
     "threads": 1,
+    "looks": 8,
     "lod_label": "2.0",
     "drape": False,
     "suppose": False,
@@ -310,7 +311,7 @@ def signatures(
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
         s[f"model_{task}"] = h(model.sha256, str(model.path))
-    inference = some("provider", "threads")  # sums in another order differ in their last bits
+    inference = some("provider", "threads", "looks")  # sums in another order differ in their last bits
     if supposes(settings, models):
         s["supposed"] = h(s["tiles"], models["sections"].sha256, angles, inference)
         seen = {task: told and [told, s["supposed"]] for task, told in seen.items()}

@@ -71,7 +71,8 @@ def main(argv: list[str] | None = None) -> None:
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
-    network = runtime.open_network(model, supposed.told(facts, core, args.supposed), args.provider, args.threads)
+    geometry = supposed.told(facts, core, args.supposed)
+    network = runtime.open_network(model, geometry, args.provider, args.threads, args.looks)
     views, table, heights = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
     clear = valid & ~sections.burnt_out(rgb, valid, views, tiling, core)
     sections.write(views, clear, tiling, core, args.seam_rule, args)

@@ -135,8 +135,7 @@ def main(argv: list[str] | None = None) -> None:
     task = store.read_json(args.model)["contract"]["task"]
     model = runtime.from_record(args.model, task)
     tiling = Tiling(model.contract["tile"], args.margin, args.block)
-    once = model._replace(contract={**model.contract, "flips": 1})
-    session = runtime.opened(once, args.provider, args.threads)
+    session = runtime.opened(model, args.provider, args.threads, looks=1)
 
     def network(view: Direction | None, sun: Direction | None) -> runtime.Network:
         return session(runtime.geometry_vector(view and view.lean, sun and sun.lean, facts.grid.gsd))

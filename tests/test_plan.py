@@ -223,8 +223,8 @@ def test_a_simulated_city_reruns_with_its_file(files):
     assert sources() != first
 
 
-@pytest.mark.parametrize("settings", [{"provider": "openvino"}, {"threads": 2}])
-def test_other_hardware_reruns_the_models_and_nothing_before(files, settings):
+@pytest.mark.parametrize("settings", [{"provider": "openvino"}, {"threads": 2}, {"looks": 1}])
+def test_other_hardware_and_fewer_looks_rerun_the_models_and_nothing_before(files, settings):
     """Sums in another order differ in their last bits: blocks of both are never mixed."""
     assert changed(files, **settings) == {"sections", "blend", "corners", "single", *AFTER_DETECTION}
 

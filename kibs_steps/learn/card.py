@@ -94,7 +94,7 @@ def text(name: str, models: list[contracts.Model], runs: list[dict[str, Any]]) -
         network = next(iter(kept.values()))
         lines += [
             "",
-            f"`{network}` is told no {' and no '.join(kept)}: it was trained for images of which none is known.",
+            f"`{network}` is told no {' and no '.join(kept)}: it is for images of which that is not known.",
         ]
     lines.append("")
     metrics = next((m.contract["metrics"] for m in models if m.contract.get("metrics")), None)

@@ -177,7 +177,7 @@ def agree(models: list[Model]) -> None:
 
 
 def untold(model: Model) -> list[str]:
-    """The directions (`view`, `sun`) that a model was never told in training, and is to be told nowhere."""
+    """The directions (`view`, `sun`) that are kept from a model: it is for images of which they are not known."""
     return model.contract["trained_on"].get("untold", [])
 
 

@@ -34,6 +34,7 @@ PROVIDERS: dict[str, tuple[str, str, dict[str, object]]] = {  # onnxruntime's na
     "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino", {"device_type": "CPU", "precision": "FP32"}),
 }
 
+MOST_LOOKS = 8  # at a tile: a square has no more symmetries
 LEANING = 0.25  # px per metre of height: what leans less is seen from above
 TOLD = {"view": [0, 1, 4], "sun": [2, 3, 5]}  # columns of the geometry input
 DIRECTED = ("offset", "slope", "centre")  # maps whose two channels are a vector (col, row) of the image
@@ -47,9 +48,10 @@ class ProviderMissing(KibsError):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of a step that runs a model: `--provider`, `--threads`."""
+    """The options of a step that runs a model: `--provider`, `--threads`, `--looks`."""
     parser.add_argument("--provider", choices=list(PROVIDERS), default="cpu", help="where onnxruntime computes")
     parser.add_argument("--threads", type=int, default=1, help="cores of one session")
+    parser.add_argument("--looks", type=int, default=MOST_LOOKS, help="most symmetric views in which a tile is seen")
 
 
 def geometry_vector(view: tuple[float, float] | None, sun: tuple[float, float] | None, gsd: float) -> np.ndarray:
@@ -68,17 +70,21 @@ def geometry_vector(view: tuple[float, float] | None, sun: tuple[float, float] |
     return vector
 
 
-def open_network(model: contracts.Model, geometry: np.ndarray, provider: str = "cpu", threads: int = 1) -> Network:
+def open_network(
+    model: contracts.Model, geometry: np.ndarray, provider: str = "cpu", threads: int = 1, looks: int = MOST_LOOKS
+) -> Network:
     """The network of a model for one geometry (1, 6), as `opened` gives them."""
-    return opened(model, provider, threads)(geometry)
+    return opened(model, provider, threads, looks)(geometry)
 
 
-def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> Callable[[np.ndarray], Network]:
+def opened(
+    model: contracts.Model, provider: str = "cpu", threads: int = 1, looks: int = MOST_LOOKS
+) -> Callable[[np.ndarray], Network]:
     """A session of a model: for a geometry (1, 6) a function from an image (s, s, 3) uint8 to the model's named outputs without
     their batch axis.
 
-    Dense models are run on the symmetric views of the tile that `shown` gives, and their maps averaged.
-    The geometry goes to models whose contract asks for it, but for what they were never told (`untold`). `provider` is a key of
+    Dense models are run on the symmetric views of the tile that `shown` gives, at most on `looks`, and their maps averaged.
+    The geometry goes to models whose contract asks for it, but for what is kept from them (`untold`). `provider` is a key of
     `PROVIDERS`; `threads` within an operator. Raises `ProviderMissing`.
     """
     import onnxruntime as ort
@@ -117,7 +123,7 @@ def opened(model: contracts.Model, provider: str = "cpu", threads: int = 1) -> C
             geometry[:, TOLD[direction]] = 0
         if not dense:
             return lambda rgb: run(rgb, geometry)
-        views = shown(model.contract, geometry)
+        views = shown(model.contract, geometry)[:looks]
 
         def network(rgb: np.ndarray) -> dict[str, np.ndarray]:
             total: dict[str, np.ndarray] = {}

@@ -49,9 +49,9 @@ def choose(found: list[Set], gsd: float | None, view: dict[str, float] | None, s
     """The set for a scene of `gsd` (m/px; None unknown) seen and lit from `view` and `sun` (azimuth, elevation deg, or None).
 
     The set whose models were trained nearest to the scene's angles, all that cover them being equally near; then the nearest
-    GSD that is not finer than the raster (else the coarsest); then the set that was told in training what is known of the scene
-    and no more, of its view first; then the set of the narrowest range of views, the widest where the view is unknown; then by
-    path.
+    GSD that is not finer than the raster (else the coarsest); then the set that is told what is known of the scene and kept from
+    what is not, the view counting first; then the set of the narrowest range of views, the widest where the view is unknown;
+    then by path.
     """
     known = {"view": view is not None, "sun": sun is not None}
 

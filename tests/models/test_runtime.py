@@ -61,7 +61,7 @@ def test_flips_leave_a_symmetric_network_alone(tmp_path):
         (["view", "sun"], [0] * 6),
     ],
 )
-def test_what_a_model_was_never_told_is_kept_from_it(tmp_path, untold, kept):
+def test_what_a_model_is_not_told_is_kept_from_it(tmp_path, untold, kept):
     """A network that answers with what it was told."""
     ones = np.ones((1, 6, toy.TILE, toy.TILE), np.float32)
     nodes = [
@@ -80,6 +80,23 @@ def test_what_a_model_was_never_told_is_kept_from_it(tmp_path, untold, kept):
     found = runtime.open_network(model, geometry)(np.zeros((toy.TILE, toy.TILE, 3), np.uint8))["roof"][:, 0, 0]
     assert found.tolist() == kept
     assert geometry.tolist() == [[1, 2, 3, 4, 1, 1]]
+
+
+def test_fewer_looks_are_the_first_of_all(tmp_path):
+    """A model that answers with the column of every pixel: one look gives the ramp, all eight what is the same from all sides."""
+    ramp = np.broadcast_to(np.arange(toy.TILE, dtype=np.float32), (1, 1, toy.TILE, toy.TILE))
+    terms = toy.contract("sections", flips=8)
+    path = toy.save(
+        [helper.make_node("Identity", ["ramp"], ["roof"])],
+        {"ramp": ramp},
+        {"roof": [1, 1, *2 * [toy.TILE]]},
+        tmp_path / "ramp.onnx",
+        terms,
+    )
+    model, image = contract.Model(path, "", terms), np.zeros((toy.TILE, toy.TILE, 3), np.uint8)
+    one, all_ = (runtime.open_network(model, np.zeros((1, 6)), looks=n)(image)["roof"][0] for n in (1, 8))
+    np.testing.assert_array_equal(one, ramp[0, 0])
+    np.testing.assert_allclose(all_, (toy.TILE - 1) / 2)
 
 
 def test_maps_of_any_stride_are_brought_to_pixels():

@@ -25,7 +25,7 @@ rule supposed:
         signature=signature("supposed"),
         tiling=lambda w: plan(w).tiling,
         raster=blocks_read,
-        options=options("provider", "threads"),
+        options=options("provider", "threads", "looks"),
     shell:
         "python -m kibs_steps.supposed --scene {input.scene:q} --raster {params.raster:q} --model {input.model:q}"
         " --margin {params.tiling.margin} --block {params.tiling.block} {params.options:q} --out {output:q} > {log:q} 2>&1"
@@ -67,7 +67,7 @@ rule sections:
         signature=signature("sections"),
         supposed=lambda w: [f"--supposed={f}" for f in supposed(w)],
         tiling=lambda w: plan(w).tiling,
-        options=options("provider", "threads"),
+        options=options("provider", "threads", "looks"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.sections --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
@@ -136,7 +136,7 @@ rule corners:
         signature=signature("corners"),
         supposed=lambda w: [f"--supposed={f}" for f in supposed(w)],
         tiling=lambda w: plan(w).tiling,
-        options=options("provider", "threads"),
+        options=options("provider", "threads", "looks"),
     shell:
         "python -m kibs_steps.corners --scene {input.scene:q} --blended {input.blended:q} --labels {input.labels:q}"
         " --model {input.model:q} --name {wildcards.block} --margin {params.tiling.margin} --block {params.tiling.block}"
@@ -183,7 +183,7 @@ rule single:
         signature=signature("single"),
         supposed=lambda w: [f"--supposed={f}" for f in supposed(w)],
         tiling=lambda w: plan(w).tiling,
-        options=options("provider", "threads"),
+        options=options("provider", "threads", "looks"),
         seams=lambda w: plan(w).seam_rule,
     shell:
         "python -m kibs_steps.single --scene {input.scene:q} --tiles {input.tiles:q} --model {input.model:q}"
