@@ -48,12 +48,14 @@ def test_the_shipped_models_are_for_two_gsds(name, gsd, expected):
 
 
 @pytest.mark.parametrize(
-    ("elevation", "nadir"), [(59.3, False), (80.0, False), (86.0, True), (90.0, True), (None, False)]
+    ("elevation", "folder"),
+    [(59.3, "research"), (80.0, "research"), (86.0, "nadir"), (90.0, "nadir"), (None, "unknown-view")],
 )
-def test_views_from_above_get_the_set_that_sees_more_finely(elevation, nadir):
+def test_views_from_above_and_unknown_ones_get_sets_of_their_own(elevation, folder):
     view = None if elevation is None else {"azimuth": 30.0, "elevation": elevation}
-    one = suite.choose(suite.sets(SHIPPED / "research", PAIR), 0.38, view, None)
-    assert (one["sections"].path.parent.name == "nadir") is nadir
+    for sun in (None, {"azimuth": 155.0, "elevation": 45.0}):
+        one = suite.choose(suite.sets(SHIPPED / "research", PAIR), 0.38, view, sun)
+        assert one["sections"].path.parent.name == folder
 
 
 def test_the_shipped_sets_say_what_may_be_done_with_them():
@@ -91,7 +93,7 @@ def test_the_more_special_of_two_that_cover(tmp_path):
     assert chosen(tmp_path, 0.38).stem == "sections-all"  # seen from nobody knows where
 
 
-def test_a_scene_gets_the_set_that_was_told_what_is_known_of_it(tmp_path):
+def test_a_scene_gets_the_set_for_what_is_known_of_it(tmp_path):
     add(tmp_path, "-told")
     add(tmp_path, "-sun", untold=["view"])
     add(tmp_path, "-none", untold=["view", "sun"])
