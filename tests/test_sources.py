@@ -125,7 +125,7 @@ def test_a_suite_chooses_by_the_pixels_of_a_url_too(served):
     for name, gsd in (("fine", 0.25), ("usual", toy.GSD)):
         toy.sections_model(folder / "models" / name / "sections.onnx", toy.contract("sections", gsd=gsd))
         toy.corners_model(folder / "models" / name / "corners.onnx", toy.contract("corners", gsd=gsd))
-    settings = {"models": str(folder / "models"), "method": "two_stage"}
+    settings = {"models": str(folder / "models"), "method": "two_stage", "suppose": False}
     for raster in (f"{url}/a.tif", str(folder / "a.tif")):
         found = plan.models_for({**settings, "raster": raster}, folder)
         assert found["sections"].path.parent.name == "usual", raster
