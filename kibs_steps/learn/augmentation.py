@@ -69,10 +69,9 @@ def without_geometry(
 ) -> Sample:
     """Forgets now the view, now the sun, each in its share of the tiles, so that a network learns to do without."""
     geometry = sample.geometry.copy()
-    for share, vector, flag in zip(shares, (slice(0, 2), slice(2, 4)), (4, 5), strict=True):
+    for share, columns in zip(shares, runtime.TOLD.values(), strict=True):
         if rng.random() < share:
-            geometry[vector] = 0
-            geometry[flag] = 0
+            geometry[columns] = 0
     return sample._replace(geometry=geometry)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from kibs_steps import fingerprint, photographs, store
 from kibs_steps.learn import augmentation, dataset
 from kibs_steps.learn.samples import Sample
+from kibs_steps.models import runtime
 from kibs_steps.simulate import citymodel, draped
 
 NAMES = ("simulated", "pasted", "chips", "own")
@@ -31,7 +32,7 @@ SIMULATED = "MIT, as the code: trained on simulated scenes only"
 AND = "; and "  # between the terms of a licence
 OWN = "as the owner of the training data decides"
 TALL_EVERY = 3  # one simulated tile in so many shows tall buildings
-DIRECTIONS = ("view", "sun")  # that networks are told, where they are known
+DIRECTIONS = tuple(runtime.TOLD)  # that networks are told, where they are known
 HELD_OUT = 900_000  # seeds of simulated validation tiles begin here
 TOLD_ANGLES = 3.0  # deg: how far from the one view of its training a fine-tuned model may be used
 

@@ -36,7 +36,7 @@ PROVIDERS: dict[str, tuple[str, str, dict[str, object]]] = {  # onnxruntime's na
 
 MOST_LOOKS = 8  # at a tile: a square has no more symmetries
 LEANING = 0.25  # px per metre of height: what leans less is seen from above
-TOLD = {"view": [0, 1, 4], "sun": [2, 3, 5]}  # columns of the geometry input
+TOLD = {"view": [0, 1, 4], "sun": [2, 3, 5]}  # what networks are told: columns of the geometry input
 DIRECTED = ("offset", "slope", "centre")  # maps whose two channels are a vector (col, row) of the image
 FULL = ("roof", "edge", "distance", "slope", "centre")  # maps that are needed at every pixel, whatever their stride
 
