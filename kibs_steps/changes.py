@@ -47,13 +47,9 @@ def pairs_of(old: np.ndarray, new: np.ndarray) -> list[tuple[int, int]]:
     order = np.lexsort((j, i, -shared))
     candidates = [(int(i[k]), int(j[k])) for k in order if shared[k] >= OVERLAP * smaller[k] and shared[k] > 0]
     middle = [shapely.get_coordinates(shapely.centroid(g)) for g in (old, new)]
-    apart, near = cKDTree(middle[0]).query(middle[1], k=min(4, len(old)), distance_upper_bound=NEAR)
-    apart, near = (a.reshape(len(new), -1) for a in (apart, near))
+    near = cKDTree(middle[0]).query_ball_point(middle[1], NEAR)
     close = [
-        (round(float(d), 6), int(o), n)
-        for n in range(len(new))
-        for d, o in zip(apart[n], near[n], strict=True)
-        if np.isfinite(d)
+        (round(float(np.hypot(*(middle[0][o] - middle[1][n]))), 6), o, n) for n in range(len(new)) for o in near[n]
     ]
     for _, o, n in sorted(close):
         size = sorted((old[o].area, new[n].area))

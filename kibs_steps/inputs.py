@@ -56,7 +56,8 @@ def check(plan: Plan, results: Path) -> list[str]:
     if settings.get("regions"):
         regions.read(settings["regions"], grid)
     if plan.truth:
-        check_truth(plan.truth, settings["truth_frame"], grid)
+        # Projected on one height, things stand as far from where they are seen as only `scene` finds out.
+        check_truth(plan.truth, settings["truth_frame"], grid, placed=settings.get("projection_height") is None)
     if settings.get("footprints"):
         check_footprints(settings["footprints"])
     if settings.get("sections"):
@@ -81,8 +82,8 @@ def writable(folder: Path) -> None:
         raise ResultsUnwritable(f"{folder} cannot be written: {there} is not yours; start in a folder that is")
 
 
-def check_truth(path: str, frame: str, grid: Any) -> None:
-    """Look at a truth layer's header; raises what `truth` raises."""
+def check_truth(path: str, frame: str, grid: Any, placed: bool = True) -> None:
+    """Look at a truth layer's header; raises what `truth` raises. `placed`: what the grid shows stands about there."""
     import pyogrio
     import pyproj
 
@@ -102,9 +103,10 @@ def check_truth(path: str, frame: str, grid: Any) -> None:
         bounds = (*bounds[:2].min(axis=1), *bounds[2:].max(axis=1))
     move = pyproj.Transformer.from_crs(pyproj.CRS.from_user_input(facts["crs"]).to_2d(), grid.crs, always_xy=True)
     left, bottom, right, top = move.transform_bounds(*bounds)
-    if left > grid.bounds[2] + truth.AROUND or right < grid.bounds[0] - truth.AROUND or (
+    off = left > grid.bounds[2] + truth.AROUND or right < grid.bounds[0] - truth.AROUND or (
         bottom > grid.bounds[3] + truth.AROUND or top < grid.bounds[1] - truth.AROUND
-    ):  # fmt: skip
+    )  # fmt: skip
+    if placed and off:
         raise truth.NoOverlap(
             f"truth {path}, layer {name} ({facts['crs']}) lies at {left:.0f} {bottom:.0f} {right:.0f} {top:.0f} in {grid.crs}, "
             "outside the scene: check the layer's CRS and the raster it belongs to"

@@ -213,6 +213,8 @@ def _snapped(
 ) -> list[shapely.Geometry]:
     """Sections with the vertices and edges they share brought together within `reach` (m)."""
     parts, part_section = shapely.get_parts(np.array(polygons, object), return_index=True)
+    there = ~shapely.is_empty(parts)  # a section without area is a part without rings
+    parts, part_section = parts[there], part_section[there]
     rings, ring_part = shapely.get_rings(parts, return_index=True)
     xy, ring = shapely.get_coordinates(rings, return_index=True)
     last = np.r_[np.diff(ring) != 0, True]

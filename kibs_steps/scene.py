@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,6 +23,9 @@ from kibs_steps.view import Surface
 if TYPE_CHECKING:
     import rasterio
     import shapely
+
+
+SETTLED = 8  # steps after which a place at the border of two regions is left to one of them
 
 
 class AnglesUnusable(KibsError):
@@ -89,6 +93,19 @@ class Scene(NamedTuple):
         if not self.regions:
             return np.broadcast_to(np.array(self.lean, float), (len(seen), 2))
         return np.array([v.lean if v else (0.0, 0.0) for v in self.views(seen)], float).reshape(-1, 2)
+
+    def leans_of(self, standing: np.ndarray, dtm: Surface) -> np.ndarray:
+        """Lean (n, 2) at things that *stand* at `standing` (n, 3 map metres): that of where the image shows them.
+
+        Where that is follows from the lean itself: it is settled step by step from the place where they stand.
+        """
+        lean = self.leans(standing[:, :2])
+        for _ in range(len(self.regions) and SETTLED):
+            seen = geometry.image_position(standing[:, :2], standing[:, 2], lean, self.projected_on(dtm))
+            before, lean = lean, self.leans(seen)
+            if np.array_equal(before, lean):
+                break
+        return lean
 
     def terrain(
         self, bounds: tuple[float, float, float, float], margin: float = 200.0, step: float = 0.0
@@ -295,13 +312,20 @@ def _ground(
         return record, 0.0
     moves = terrain_model.STAYS
     for _ in range(8):
-        above = np.array(terrain_model.extremes(path)) - projection_height
-        wanted = (above[:, None, None] * np.array(leans)[None]).reshape(-1, 2)
+        wanted = moves_on(path, projection_height, leans)
         if len(moves) == len(wanted) and np.allclose(moves, wanted):
             break
         moves = wanted
         record = terrain_model.write(dtm, grid, footprint, path, moves=moves)
     return record, float(np.hypot(*moves.T).max())
+
+
+def moves_on(path: str | Path, projection_height: float, leans: Sequence[tuple[float, float]]) -> np.ndarray:
+    """How far (m, 2 map metres) ground of the lowest and the highest height of a `dtm.tif` stands from where it is seen."""
+    from kibs_steps import dtm as terrain_model
+
+    above = np.array(terrain_model.extremes(path)) - projection_height
+    return (above[:, None, None] * np.array(leans)[None]).reshape(-1, 2)
 
 
 def _numbers(text: str) -> tuple[int, ...]:

@@ -26,6 +26,7 @@ STEP = 0.25  # m of height between two looks along a ray
 POINTS = 48  # about as many per section
 INSIDE = 1.0  # px from the rim, where a surface model mixes roof and ground
 SIGMA = 0.3  # m, of one height in an ordinary DSM
+MARGIN = 200.0  # m of surface around what is looked at
 
 
 def first_met(seen: np.ndarray, lean: np.ndarray, base: np.ndarray, surface: Terrain) -> np.ndarray:
@@ -89,7 +90,7 @@ def under(sections: pa.Table, facts: scene.Scene, path: str | Path, terrain: vie
     """`measured` with the part of `surface.tif` around the sections."""
     from kibs_steps.terrain import read
 
-    return measured(sections, facts, read(path, map_bounds(sections, facts)), terrain)
+    return measured(sections, facts, read(path, map_bounds(sections, facts), MARGIN + facts.displaced), terrain)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -104,7 +105,11 @@ def main(argv: list[str] | None = None) -> None:
     facts = scene.read(args.scene)
     with imagery.opened(facts.raster) as source:
         footprint = imagery.outline(source, pyproj.CRS.from_user_input(facts.grid.crs))
-    dtm.write(args.dsm, facts.grid, footprint, args.out, "dsm")
+    moves = dtm.STAYS
+    if facts.displaced:  # where the ground stands: the surface is needed there
+        leans = [seen_from.lean for seen_from in (facts.view, *(region.view for region in facts.regions)) if seen_from]
+        moves = scene.moves_on(facts.folder / "dtm.tif", facts.projection_height, leans)
+    dtm.write(args.dsm, facts.grid, footprint, args.out, "dsm", moves)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ FRAMES = ("image", "map")
 VERTICAL = ("absolute", "above_ground")
 LAYERS = {"image": ("sections_image", "roof_sections_image"), "map": ("sections_map", "roof_sections")}
 PLAUSIBLE = (-20.0, 400.0)  # m above ground; a layer whose median height is outside was read with the wrong `--z`
-AROUND = 1000.0  # m; what is drawn farther from the raster never shows in it
+AROUND = 1000.0  # m; what stands farther from where the raster shows ground never shows in it
 CELL = 1024.0  # m; terrain is read cell by cell, so memory does not grow with the scene
 STEEPEST = 5.0  # m per m (79°); a steeper "roof" is painted flat: its plane says nothing about a pixel
 
@@ -189,7 +189,13 @@ def convert(
     for rows in _cells(polygons):
         terrain = scene.terrain(tuple(shapely.total_bounds(polygons[rows])), margin=500.0)
         points, owner = shapely.get_coordinates(polygons[rows], include_z=True, return_index=True)
-        lean = scene.leans(shapely.get_coordinates(shapely.centroid(polygons[rows])))[owner]
+        middle = shapely.get_coordinates(shapely.centroid(polygons[rows]))
+        if frame == "map":
+            z = np.bincount(owner, points[:, 2]) / np.bincount(owner)
+            z = z if vertical == "absolute" else z + terrain(middle)
+            lean = scene.leans_of(np.column_stack([middle, z]), terrain)[owner]
+        else:
+            lean = scene.leans(middle)[owner]
         image, ground = both_frames(points, frame, vertical, terrain, lean, scene.projected_on(terrain))
         pixels = np.column_stack([scene.grid.to_image(image[:, :2]), image[:, 2]])
         seen[rows] = shapely.set_coordinates(polygons[rows].copy(), pixels)
@@ -218,7 +224,7 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
         )
     grid = scene.grid
     polygons = to_grid(layer, grid)
-    rows = np.flatnonzero(_meets(shapely.bounds(polygons), grid.bounds, AROUND))
+    rows = np.flatnonzero(_meets(shapely.bounds(polygons), grid.bounds, AROUND + scene.displaced))
     seen, standing = convert(polygons[rows], scene, frame, vertical) if rows.size else (polygons[:0], polygons[:0])
     if rows.size:
         _plausible(shapely.get_coordinates(seen, include_z=True)[:, 2], layer.name, vertical)
@@ -235,7 +241,7 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
 
     own = layer.columns.get("section_id", layer.columns.get("truth_id"))
     numbered = np.arange(1, len(polygons) + 1)
-    ids = own if own is not None and _are_labels(own) else numbered
+    ids = _numbers(own).astype(np.int64) if own is not None and _are_labels(own) else numbered
     building = layer.columns.get("building_id", layer.columns.get("building"))
     split, visible = layer.columns.get("split"), layer.columns.get("visible")
 
@@ -248,7 +254,7 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
 
     return pa.table(
         {
-            "truth_id": pa.array(np.asarray(ids)[rows], pa.int64()),
+            "truth_id": pa.array(ids[rows], pa.int64()),
             "building": taken(building, pa.int64()),
             "outline_seen": pa.array(shapely.to_wkb(seen), pa.binary()),
             "outline_map": pa.array(shapely.to_wkb(standing), pa.binary()),

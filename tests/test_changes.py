@@ -55,6 +55,17 @@ def test_every_kind_of_change(tmp_path, capsys):
     assert "building 5 -> 15: moved, higher" in text
 
 
+def test_a_building_that_moved_past_its_sheds(tmp_path):
+    """However many unchanged ones stand nearer to where it was."""
+    sheds = [(10 + k, 13.5, 2.0 * k - 4, 1.5, 3) for k in range(6)]
+    before = result(tmp_path / "old", [(1, 0, 0, 6, 6), *sheds])
+    after = result(tmp_path / "new", [(2, 7, 0, 6, 6), *sheds])
+    changed = changes.changes(*(changes.read(folder)[0] for folder in (before, after)))
+    assert [(r["change"], r["building_old"], r["building_new"]) for r in changed if r["change"] != "same"] == [
+        ("moved", 1, 2)
+    ]
+
+
 def test_the_other_way_round(tmp_path):
     old, new = result(tmp_path / "old", OLD), result(tmp_path / "new", NEW)
     rows = changes.changes(changes.read(new)[0], changes.read(old)[0])

@@ -149,6 +149,14 @@ def test_a_section_that_touches_itself_round_a_higher_one_is_chamfered():
         assert shells_are_valid(solid)
 
 
+@pytest.mark.parametrize("sliver", [[(0, 8), (10, 8), (10, 8.0004)], [(0, 8), (5, 8), (10, 8)]])
+def test_a_section_without_area_spoils_no_house(sliver):
+    ((_, sections),) = solids.clusters_of(houses.building_table([*houses.GABLE, (sliver, (0, 0, 3))]))
+    solid = solids.build(sections, terrain.flat(0.0))
+    row = features.attributes(1, sections, solid)
+    assert (row["lod"], row["roof_type"], row["lod_reason"]) == ("2.0", "gable", "")
+
+
 def test_parts_that_do_not_touch_are_building_parts():
     apart = [*houses.BOX, ([(9, 0), (14, 0), (14, 4), (9, 4)], (0, 0, 4))]
     sections, solid, row = built(apart)

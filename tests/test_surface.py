@@ -3,12 +3,13 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+import rasters
 import shapely
 import toy_city
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kibs_steps import ground, planes, surface
+from kibs_steps import ground, heightmap, planes, surface
 from kibs_steps.stitch import SECTIONS
 from kibs_steps.terrain import Terrain
 
@@ -71,6 +72,30 @@ def test_roofs_of_a_surface_model_come_back(tmp_path, projection_height):
     for row, (_, _, outline) in zip(result.to_pylist(), roofs, strict=True):
         found = shapely.get_coordinates(shapely.from_wkb(row["outline_map"]), include_z=True)
         np.testing.assert_allclose(found, shapely.get_coordinates(outline, include_z=True), atol=0.25)
+
+
+@pytest.mark.parametrize("projection_height", [0.0, 700.0])
+def test_a_surface_is_read_where_things_stand(tmp_path, projection_height):
+    """Ground of 800 m in an image projected on less: a roof of 10 m stands up to 468 m from where it is seen."""
+    image = rasters.write(tmp_path / "r.tif", rasters.picture(height=200, width=200))
+    size, left, top = 1600, rasters.X0 - 600, rasters.Y0 + 500
+    heights = np.full((size, size), 800.0, np.float32)
+    terrain_model = rasters.dtm(tmp_path / "dtm.tif", heights, left, top, step=1.0)
+    facts, _ = rasters.build(
+        tmp_path, image, str(terrain_model), view=(180.0, 60.0), projection_height=projection_height
+    )
+    outline = shapely.box(80, 80, 120, 120)
+    standing = facts.grid.to_map(shapely.get_coordinates(outline)) + (810 - projection_height) * np.array(facts.lean)
+    (x0, y0), (x1, y1) = standing.min(axis=0), standing.max(axis=0)
+    heights[int(top - y1) - 2 : int(top - y0) + 3, int(x0 - left) - 2 : int(x1 - left) + 3] = 810.0
+    model = rasters.dtm(tmp_path / "dsm.tif", heights, left, top, step=1.0)
+    out = tmp_path / "surface.tif"
+    surface.main([f"--scene={facts.folder / 'scene.json'}", f"--dsm={model}", f"--out={out}"])
+    columns = [[1], [shapely.to_wkb(outline)], [1.0], [2], [False], [False], [0], [heightmap.EMPTY]]
+    sections = pa.table([pa.array(c, f.type) for c, f in zip(columns, SECTIONS, strict=True)], schema=SECTIONS)
+    ground_there = facts.terrain(planes.map_bounds(sections, facts))
+    _, points = surface.under(sections, facts, out, ground_there)
+    np.testing.assert_allclose(points["height"].to_numpy(), 10.0, atol=0.05)
 
 
 def test_every_section_has_points_however_small():

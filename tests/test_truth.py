@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pyogrio
 import pytest
+import rasters
 import shapely
 import toy_city as toy
 from affine import Affine
@@ -115,6 +116,8 @@ def test_own_section_ids_are_kept(tmp_path):
     rows = read(path, scene)[0]
     assert rows["truth_id"].to_pylist() == [40, 30, 20, 10]
     assert rows["visible"].to_pylist() == [1.0, 0.5, 0.25, 0.0]
+    texts = write_layer(tmp_path / "texts.gpkg", outlines, section_id=["40", "30", "20", "10"])
+    assert read(texts, scene)[0]["truth_id"].to_pylist() == [40, 30, 20, 10]
 
 
 def test_columns_that_mean_something_else_are_no_numbers(tmp_path):
@@ -138,6 +141,37 @@ def test_a_region_is_seen_as_a_view_is(tmp_path):
     np.testing.assert_array_equal(found[0][0], found[1][0])
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
     assert len(np.unique(found[0][0])) > 3
+
+
+def test_a_roof_has_the_view_of_the_region_that_shows_it_not_of_the_one_it_stands_in(tmp_path):
+    """A roof seen west of a border, from the east: it stands beyond the border, where the view is steeper."""
+    scene = toy.make_scene(tmp_path / "scene")
+    left, bottom, right, top = scene.grid.bounds
+    leans = [view.lean(90.0, elevation) for elevation in (60.0, 70.0)]
+    parts = (shapely.box(left, bottom, left + 60, top), shapely.box(left + 60, bottom, right, top))
+    regions = tuple(Region(part, Direction(0.0, 60.0, lean)) for part, lean in zip(parts, leans, strict=True))
+    scene = scene._replace(view=None, regions=regions)
+    seen = np.array([[left + x, top - y] for x, y in ((49, 40), (57, 40), (57, 50), (49, 50))])
+    terrain = scene.terrain(scene.grid.bounds)
+    standing, z = view.ground_position(seen, np.full(4, 15.0), terrain, np.tile(leans[0], (4, 1)))
+    assert standing[:, 0].mean() > left + 60
+    roof = shapely.Polygon(np.column_stack([standing, z]))
+    pixels, _ = truth.convert(np.array([roof], object), scene, "map", "absolute")
+    found = shapely.get_coordinates(pixels, include_z=True)[:4]
+    np.testing.assert_allclose(found[:, :2], scene.grid.to_image(seen), atol=0.01)
+    np.testing.assert_allclose(found[:, 2], 15.0, atol=0.01)
+
+
+def test_truth_stands_where_a_height_it_is_projected_on_puts_it(tmp_path):
+    """Ground of 2,240 m in an image projected on 0: roofs stand 1.3 km from where they are seen."""
+    image = rasters.write(tmp_path / "r.tif", rasters.picture(height=200, width=200))
+    scene, _ = rasters.build(tmp_path, image, "2240", view=(180.0, 60.0), projection_height=0.0)
+    assert scene.displaced > truth.AROUND
+    seen = scene.grid.to_map(np.array([[80.0, 80.0], [120.0, 80.0], [120.0, 120.0], [80.0, 120.0]]))
+    roof = shapely.Polygon(np.column_stack([seen + 2250 * np.array(scene.lean), np.full(4, 2250.0)]))
+    rows = read(write_layer(tmp_path / "t.gpkg", [roof], crs=scene.grid.crs), scene)[0]
+    outline = shapely.from_wkb(rows["outline_seen"].to_pylist()[0])
+    np.testing.assert_allclose(shapely.bounds(outline), (80, 80, 120, 120), atol=0.01)
 
 
 def test_what_is_wrong_with_a_layer_is_said(tmp_path):

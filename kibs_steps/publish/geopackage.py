@@ -96,8 +96,10 @@ def outlines(wkb: pa.ChunkedArray) -> pa.Array:
 
 def footprints(solids: pa.Table) -> pa.Table:
     """Layer `footprints`: a row per polygon, so that a building whose parts do not touch has several."""
-    shapes = shapely.force_2d(shapely.from_wkb(solids["footprint"].to_numpy()))
-    parts, owner = shapely.get_parts(shapes, return_index=True)
+    solids = solids.filter(solids["footprint"].is_valid())  # what has one; that itself is the largest part alone
+    parts, owner = shapely.get_parts(
+        shapely.force_2d(shapely.from_wkb(solids["outline"].to_numpy())), return_index=True
+    )
     rows = solids.select(list(FOOTPRINT_COLUMNS)).take(pa.array(owner, pa.int64()))
     return rows.append_column(GEOMETRY, pa.array(shapely.to_wkb(parts), pa.binary()))
 

@@ -39,8 +39,13 @@ def coloured(glb: Glb, mesh: Mesh, base: np.ndarray) -> dict[str, Any]:
 
 def draped(glb: Glb, mesh: Mesh, base: np.ndarray, scene: Scene, dtm: view.Surface) -> dict[str, Any]:
     """A building's roofs with the image on them as a primitive, in metres from `base`."""
-    corners = mesh.triangles[mesh.kind[mesh.face] == 0].reshape(-1, 3)
-    lean = scene.leans(corners[:, :2])
+    roof = mesh.kind[mesh.face] == 0
+    corners = mesh.triangles[roof].reshape(-1, 3)
+    lean = np.zeros((len(corners), 2))
+    if len(corners):  # of each roof face as a whole, as it was found
+        face = np.repeat(np.unique(mesh.face[roof], return_inverse=True)[1], 3)
+        middle = np.column_stack([np.bincount(face, values) for values in corners.T]) / np.bincount(face)[:, None]
+        lean = scene.leans_of(middle, dtm)[face]
     seen = view.image_position(corners[:, :2], corners[:, 2], lean, scene.projected_on(dtm))
     uv = scene.grid.to_image(seen) / (scene.grid.width, scene.grid.height)
     place = glb.accessor("image positions", uv.astype(np.float32))

@@ -88,7 +88,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", required=True, help="out: report.html")
     args = parser.parse_args(argv)
     folder = Path(args.run).parent
-    pictures = {title: (folder / name).read_bytes() for name, title in PICTURES.items() if (folder / name).is_file()}
+    shown = {name: title for name, title in PICTURES.items() if args.evaluation or name != "evaluation.png"}
+    pictures = {title: (folder / name).read_bytes() for name, title in shown.items() if (folder / name).is_file()}
     evaluation = store.read_json(args.evaluation) if args.evaluation else None
     with store.whole(args.out) as temporary:
         temporary.write_text(page(store.read_json(args.run), evaluation, pictures), encoding="utf-8")

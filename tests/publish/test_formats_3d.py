@@ -12,12 +12,15 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+import shapely
 import toy_city
 import trimesh
 
-from kibs_steps import mesh
+from kibs_steps import mesh, view
 from kibs_steps import scene as scenes
 from kibs_steps.publish import dsm, glb, ksr, obj, tiles3d, viewer
+from kibs_steps.publish.gltf import Glb
+from kibs_steps.scene import Direction, Region
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +99,31 @@ def test_roofs_wear_the_image_where_they_are_seen(town, tmp_path):
     np.testing.assert_allclose(np.sort(roof.visual.uv[:, 0]), np.sort(uv[:, 0]), atol=1e-4)
     np.testing.assert_allclose(np.sort(1 - roof.visual.uv[:, 1]), np.sort(uv[:, 1]), atol=1e-4)
     assert roof.visual.material.baseColorTexture.size == (scene.grid.width, scene.grid.height)
+
+
+def test_a_roof_across_regions_wears_the_one_view_that_shows_it(tmp_path):
+    """A roof seen west of a border, from the east, one side of which stands beyond it."""
+    scene = toy_city.make_scene(tmp_path, direction=None)
+    left, bottom, right, top = scene.grid.bounds
+    parts = (shapely.box(left, bottom, left + 60, top), shapely.box(left + 60, bottom, right, top))
+    leans = [view.lean(azimuth, 60.0) for azimuth in (90.0, 270.0)]
+    regions = tuple(Region(part, Direction(0.0, 60.0, lean)) for part, lean in zip(parts, leans, strict=True))
+    scene = scene._replace(regions=regions)
+    dtm = scene.terrain(scene.grid.bounds)
+    seen = np.array([[left + x, top - y] for x, y in ((40, 40), (56, 40), (56, 50), (40, 50))])
+    standing, z = view.ground_position(seen, np.full(4, 10.0), dtm, np.tile(leans[0], (4, 1)))
+    assert standing[0, 0] < left + 60 < standing[1, 0]
+    corners = np.column_stack([standing, z])
+    index = np.array([[0, 1, 2], [0, 2, 3]])
+    none = np.zeros(1, int)
+    roof = mesh.Mesh(1, {}, [{}], none, corners, index, np.zeros(2, int), np.array([1]), np.array([4]), np.arange(4))
+    with Glb(tmp_path) as content:
+        body = glb.draped(content, roof, np.zeros(3), scene, dtm)
+        content.add("nodes", {"mesh": content.add("meshes", {"primitives": [body]})})
+        content.save(tmp_path / "roof.glb", {"nodes": [0]}, materials=[glb.MATT, glb.MATT])
+    (found,) = trimesh.load(tmp_path / "roof.glb", process=False).geometry.values()
+    uv = scene.grid.to_image(seen[index.ravel()]) / (scene.grid.width, scene.grid.height)
+    np.testing.assert_allclose(found.visual.uv * (1, -1) + (0, 1), uv, atol=1e-4)
 
 
 def test_an_empty_city_is_a_valid_glb(tmp_path):

@@ -205,3 +205,13 @@ def test_gdals_validator_is_content(city):
     done = subprocess.run([python, "-m", module, str(write())], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "error" not in done.stdout.lower() + done.stderr.lower()
+
+
+def test_a_building_of_parts_has_a_footprint_row_for_each():
+    parts = [shapely.box(0, 0, 10, 8), shapely.box(10.8, 0, 18.8, 8)]
+    table = solids_table().slice(0, 2).to_pylist()
+    table[0] |= {"outline": shapely.to_wkb(shapely.MultiPolygon(parts)), "footprint": shapely.to_wkb(parts[0])}
+    table[1]["footprint"] = None  # no solid
+    found = geopackage.footprints(pa.Table.from_pylist(table))
+    assert shapely.area(shapely.from_wkb(found["geom"].to_pylist())).tolist() == [80, 64]
+    assert found["building_id"].to_pylist() == [table[0]["building_id"]] * 2

@@ -1,5 +1,6 @@
 """The report says what run.json says, whatever names and reasons hold."""
 
+from kibs_steps import store
 from kibs_steps.publish import report
 
 RUN = {
@@ -39,6 +40,16 @@ def test_everything_is_told_and_nothing_is_markup():
     assert "made without the blocks" in text
     assert "data:image/png;base64,cG5n" in text
     assert "<script" not in text
+
+
+def test_a_comparison_of_before_is_not_shown(tmp_path):
+    """Without truth the picture of an earlier run says nothing of this one."""
+    store.write_json(tmp_path / "run.json", RUN)
+    (tmp_path / "evaluation.png").write_bytes(b"png")
+    store.write_json(tmp_path / "evaluation.json", {"pixels": {"all": {"iou": 0.5}}, "heights": {"found": {"all": {}}}})
+    for more, shown in (([], False), ([f"--evaluation={tmp_path / 'evaluation.json'}"], True)):
+        report.main([f"--run={tmp_path / 'run.json'}", f"--out={tmp_path / 'report.html'}", *more])
+        assert ("Comparison with the truth" in (tmp_path / "report.html").read_text()) == shown
 
 
 def test_a_scene_without_failures_and_truth():

@@ -5,10 +5,12 @@ import json
 
 import pyarrow as pa
 import pytest
+import shapely
 import toy_city as toy
 
-from kibs_steps import store
+from kibs_steps import store, view
 from kibs_steps.publish import run
+from kibs_steps.scene import Direction, Region
 
 MODEL = {
     "file": "models/free/corners.onnx",
@@ -88,6 +90,13 @@ def test_everything_is_recorded(tmp_path, capsys):
     assert found["times"]["scene"]["jobs"] == 1
     assert found["versions"]["numpy"]
     assert found["scene"]["position_corrected"]
+
+
+def test_regions_alone_move_roofs_too(tmp_path):
+    scene = toy.make_scene(tmp_path, direction=None)
+    assert not run.facts(scene)["position_corrected"]
+    region = Region(shapely.box(*scene.grid.bounds), Direction(181.0, 60.0, view.lean(181.0, 60.0)))
+    assert run.facts(scene._replace(regions=(region,)))["position_corrected"]
 
 
 def test_a_missing_input_is_named(tmp_path):
