@@ -21,6 +21,7 @@ import numpy as np
 
 from kibs_steps import cli, failures, georeference, imagery, inputs, scene, sources
 from kibs_steps import plan as plans
+from kibs_steps import view as geometry
 from kibs_steps.models import runtime
 from kibs_steps.plan import Plan
 
@@ -66,12 +67,17 @@ def size(bytes_: float) -> str:
 
 
 def tile_seconds(plan: Plan) -> dict[str, float]:
-    """Seconds that each network takes for one tile here and now, on one core."""
+    """Seconds that each network a run uses takes for one tile of the scene here and now, on one core."""
     side = plan.tiling.tile
     image = np.random.default_rng(0).integers(60, 180, (side, side, 3)).astype(np.uint8)
-    found = {}
+    settings, found = plan.settings, {}
+    view, sun = min(plans.views(settings), key=lambda v: v["elevation"], default=None), plans.direction(settings, "sun")
+    leans = (d and geometry.lean(d["azimuth"], d["elevation"]) for d in (view, sun))
+    told = runtime.geometry_vector(*leans, plan.models["sections"].contract["gsd"])
     for task, model in plan.models.items():
-        network = runtime.open_network(model, runtime.geometry_vector(None, None, model.contract["gsd"]))
+        if task == "corners" and plan.measured:
+            continue
+        network = runtime.open_network(model, told, looks=settings["looks"])
         start = time.process_time()
         network(image)
         found[task] = time.process_time() - start
@@ -92,7 +98,8 @@ def doubts(plan: Plan, results: Path, needed: float) -> list[str]:
             ranges = ", ".join(f"{low:g}-{high:g}" for low, high, _ in facts["stretch"])
             found.append(f"{facts['dtype']} values are brought to 8 bit from {ranges} (1st to 99th percentile)")
         if settings.get("view_azimuth") is None:
-            found.append("view angles unknown: roofs are not moved to where they stand")
+            there = " outside the regions" if settings.get("regions") else ""
+            found.append(f"view angles unknown{there}: roofs are not moved to where they stand")
         if not plan.terrain_files and not sources.is_remote(plan.dtm):
             found.append(f"the ground is taken as level at {float(plan.dtm):g} m")
     if plan.truth is None and settings.get("simulate") is None:
@@ -128,7 +135,7 @@ def page(plan: Plan, results: Path, todo: Mapping[str, int]) -> str:
         "image": image,
         "grid": f"{width} x {height} px of {gsd:g} m in {crs}: {width * height / 1e6:.2f} Mpx, "
         f"{width * height * gsd**2 / 1e6:.2f} km², {rows * cols} tiles in {len(plan.blocks)} blocks",
-        "view": _direction(settings, "view"),
+        "view": _direction(settings, "view") + (f"; regions {settings['regions']}" if settings.get("regions") else ""),
         "sun": _direction(settings, "sun"),
         "terrain": plan.dtm,
         "models": models,

@@ -16,6 +16,25 @@ from xml.etree import ElementTree
 from kibs_steps import store
 from kibs_steps.errors import KibsError
 
+GEOREFERENCES = (".tfw", ".tifw", ".jgw", ".jp2w", ".j2w", ".pgw", ".bpw", ".wld", ".prj", ".hdr")
+RASTERS = (
+    ".tif",
+    ".tiff",
+    ".jpg",
+    ".jpeg",
+    ".jp2",
+    ".j2k",
+    ".png",
+    ".bmp",
+    ".asc",
+    ".xyz",
+    ".img",
+    ".bil",
+    ".bsq",
+    ".bip",
+    ".flt",
+)
+
 
 def of_file(path: str | Path, cache: str | Path) -> str:
     """sha256 of a file's content; `cache` is a JSON file that may be missing or damaged."""
@@ -49,7 +68,8 @@ def of_source(path: str | Path, cache: str | Path) -> str | list[str]:
 
 
 def companions(path: Path) -> list[Path]:
-    """The files here that hold a part of what a file shows: rasters of a VRT, tables of a shapefile, all of a folder."""
+    """The files here that hold a part of what a file shows: rasters of a VRT, tables of a shapefile, all of a folder, where a
+    raster without a header lies, and edits that SQLite has not yet brought into a GeoPackage."""
     if path.is_dir():
         return sorted(file for file in path.rglob("*") if file.is_file() and file.suffix != ".lock")
     if path.suffix.lower() == ".shp":
@@ -57,8 +77,17 @@ def companions(path: Path) -> list[Path]:
         return sorted(f for f in path.parent.glob(f"{glob.escape(path.stem)}.*") if f.suffix.lower() in parts)
     found = [path]
     for file in found:  # which grows: a VRT may name others
-        found += dict.fromkeys(part for part in _named_in(file) if part.is_file() and part not in found)
+        parts = [*_named_in(file), *_beside(file)]
+        found += dict.fromkeys(part for part in parts if part.is_file() and part not in found)
     return found[1:]
+
+
+def _beside(file: Path) -> list[Path]:
+    """The files that may stand beside a raster or a GeoPackage and tell more of it."""
+    edits = file.with_name(f"{file.name}-wal")
+    masks = file.with_name(f"{file.name}.msk")
+    about = [file.with_suffix(ending) for ending in GEOREFERENCES] if file.suffix.lower() in RASTERS else []
+    return [masks, *about, *([edits] if edits.is_file() and edits.stat().st_size else [])]
 
 
 def _named_in(vrt: Path) -> list[Path]:

@@ -105,6 +105,12 @@ class Plan(NamedTuple):
         return self.models["corners"].contract["thresholds"].get("corner_radius", REACH)
 
     @property
+    def measured(self) -> bool:
+        """Whether heights come from a surface model, so that the 3D model has nothing to do."""
+        two = self.settings["feed"] == "models" and self.settings["method"] == "two_stage"
+        return two and bool(self.settings.get("dsm"))
+
+    @property
     def tolerance(self) -> float:
         """How far smoothing may move an outline, px; truth keeps its exact outlines."""
         return 0.0 if self.settings["feed"] == "truth" else TOLERANCE
@@ -117,14 +123,14 @@ def scenes(config: dict[str, Any], schema: dict[str, Any], told: Collection[str]
     """
     user_settings.check(config, schema)
     common = {k: v for k, v in config.items() if k not in RUN_KEYS}
-    listed = config.get("scenes") or {}
+    listed = {str(name): own for name, own in (config.get("scenes") or {}).items()}
     wanted = [str(config["scene"])] if config.get("scene") else list(listed)
     if not wanted:
         raise BadConfig(
             "no scene to build: add one under `scenes:` in config.yaml, or give --config scene=NAME raster=FILE"
         )
     last = {k: v for k, v in common.items() if k in told}
-    return {str(name): {**DEFAULTS, **common, **(listed.get(name) or {}), **last} for name in wanted}
+    return {name: {**DEFAULTS, **common, **(listed.get(name) or {}), **last} for name in wanted}
 
 
 def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan:
@@ -214,6 +220,17 @@ def direction(settings: dict[str, Any], name: str) -> dict[str, float] | None:
     return angles if None not in angles.values() else None
 
 
+def views(settings: dict[str, Any]) -> list[dict[str, float]]:
+    """Azimuth and elevation (deg) of every view of the scene: its own, if it is known, and those of its `regions`."""
+    own = direction(settings, "view")
+    found = [own] if own else []
+    if settings.get("regions"):
+        from kibs_steps import regions
+
+        found += regions.views(settings["regions"])
+    return found
+
+
 def models_for(settings: dict[str, Any], base: Path) -> dict[str, contract.Model]:
     """The models of a scene for `sections` and `corners` (one model twice where the method is `single`).
 
@@ -225,7 +242,8 @@ def models_for(settings: dict[str, Any], base: Path) -> dict[str, contract.Model
         gsd = {**SIMULATED, **simulated}["gsd"] if simulated else own_gsd(settings.get("raster"))
         if settings["suppose"]:  # something to tell is wanted
             found = [one for one in found if not any(map(contract.untold, one.values()))] or found
-        chosen = suite.choose(found, gsd, direction(settings, "view"), direction(settings, "sun"))
+        lowest = min(views(settings), key=lambda view: view["elevation"], default=None)
+        chosen = suite.choose(found, gsd, lowest, direction(settings, "sun"))
     else:
         (chosen,) = found
     return {task: chosen.get(task) or chosen["both"] for task in ("sections", "corners")}
@@ -245,8 +263,12 @@ def own_gsd(raster: str | None) -> float | None:
 
 def angle_warnings(settings: dict[str, Any], models: dict[str, contract.Model]) -> list[str]:
     """What the models say of the scene's angles; raises `contract.AngleOutsideTraining` where they refuse them."""
-    view, sun = direction(settings, "view"), direction(settings, "sun")
-    found = [contract.check_angles(model, view, sun, settings["allow_angles"]) for model in models.values()]
+    sun = direction(settings, "sun")
+    found = [
+        contract.check_angles(model, view, sun, settings["allow_angles"])
+        for view in views(settings) or [None]
+        for model in models.values()
+    ]
     return list(dict.fromkeys(warning for warnings in found for warning in warnings))
 
 

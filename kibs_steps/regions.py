@@ -6,10 +6,14 @@ In: a polygon layer with `view_azimuth` and `view_elevation` (deg) of each part.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Region, direction
+
+if TYPE_CHECKING:
+    import geopandas
 
 
 class RegionsUnusable(KibsError):
@@ -21,9 +25,25 @@ def read(path: str | Path, grid: Grid) -> tuple[Region, ...]:
 
     Where polygons overlap the later one holds. Raises `RegionsUnusable`, `AnglesUnusable`.
     """
+    import shapely
+
+    frame = _layer(path).to_crs(grid.crs)
+    outlines = shapely.make_valid(shapely.force_2d(frame.geometry.to_numpy()))
+    angles = zip(frame["view_azimuth"], frame["view_elevation"], strict=True)
+    return tuple(Region(o, direction(*a, grid, "view")) for o, a in zip(outlines, angles, strict=True))
+
+
+def views(path: str | Path) -> list[dict[str, float]]:
+    """Azimuth and elevation (deg) of the regions of a layer, each view once. Raises `RegionsUnusable`."""
+    frame = _layer(path)
+    found = dict.fromkeys(zip(frame["view_azimuth"], frame["view_elevation"], strict=True))
+    return [{"azimuth": azimuth % 360, "elevation": elevation} for azimuth, elevation in found]
+
+
+def _layer(path: str | Path) -> geopandas.GeoDataFrame:
+    """The polygons of a layer with their angles as numbers."""
     import geopandas
     import pyogrio
-    import shapely
 
     try:
         frame = geopandas.read_file(path)
@@ -38,7 +58,7 @@ def read(path: str | Path, grid: Grid) -> tuple[Region, ...]:
         )
     if frame.crs is None:
         raise RegionsUnusable(f"regions {path} has no CRS: assign it, or save it as GeoJSON in WGS 84")
-    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].to_crs(grid.crs)
+    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])]
     if frame.empty:
         raise RegionsUnusable(f"regions {path} holds no polygon: draw the parts of the image that share a view")
     try:
@@ -47,6 +67,4 @@ def read(path: str | Path, grid: Grid) -> tuple[Region, ...]:
         raise RegionsUnusable(f"regions {path}: an angle is no number ({error}): give degrees, as in 181.1") from error
     if azimuth.isna().any() or elevation.isna().any():
         raise RegionsUnusable(f"regions {path}: a polygon has no view_azimuth or view_elevation: fill in both")
-    outlines = shapely.make_valid(shapely.force_2d(frame.geometry.to_numpy()))
-    angles = zip(azimuth, elevation, strict=True)
-    return tuple(Region(o, direction(*a, grid, "view")) for o, a in zip(outlines, angles, strict=True))
+    return frame.assign(view_azimuth=azimuth, view_elevation=elevation)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
+import pytest
 import yaml
 
 sys.path.insert(0, str(Path(__file__).parent / "faults"))
@@ -29,6 +31,27 @@ def test_a_page(tmp_path, monkeypatch):
         assert told in text, told
     done = check.page(planned, tmp_path / "results", dict.fromkeys(STEPS, 0))
     assert "nothing: all blocks are made" in done
+
+
+def test_only_what_a_run_does_is_timed(tmp_path, monkeypatch):
+    """As many looks as the scene gets, told its view; no 3D model where a surface model gives the heights."""
+    config = {**cases.good(tmp_path), "dtm": 30, "looks": 1}
+    seen = []
+
+    def spy(model, geometry, looks):
+        seen.append((model.contract["task"], geometry.round(3).tolist()[0], looks))
+        return lambda rgb: {}
+
+    monkeypatch.setattr(check.runtime, "open_network", spy)
+    for more in ({}, {"dsm": str(tmp_path / "dtm.tif")}):
+        ((name, values),) = plan.scenes({**config, **more}, SCHEMA).items()
+        planned = plan.plan(name, values, tmp_path, tmp_path / "results")
+        assert set(check.tile_seconds(planned)) == ({"sections"} if more else {"sections", "corners"})
+    tasks, told, looks = zip(*seen, strict=True)
+    assert tasks == ("sections", "corners", "sections")
+    assert set(looks) == {1}
+    assert told[0][4:] == [1.0, 0.0]
+    assert told[0][1] == pytest.approx(-np.cos(np.radians(1.1)) / np.tan(np.radians(59.3)) / 0.38, abs=1e-3)
 
 
 def test_estimates_grow_with_what_is_to_do():

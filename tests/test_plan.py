@@ -2,12 +2,16 @@
 
 from pathlib import Path
 
+import geopandas
 import numpy as np
 import pytest
+import rasterio
+import shapely
 import toy
 import yaml
 
 from kibs_steps import fingerprint, plan
+from kibs_steps.models import contract
 from kibs_steps.plan import BadConfig
 
 SCHEMA = yaml.safe_load((Path(__file__).parents[1] / "workflow/schemas/config.schema.yaml").read_text())
@@ -78,6 +82,38 @@ def test_supposing_takes_a_set_that_can_be_told(files):
     assert not make(files, models=str(folder / "suite/untold"), suppose=True).supposes
 
 
+def test_regions_tell_from_where_a_scene_is_seen(files):
+    """Networks are chosen for their views, and each is held against what those were trained on."""
+    folder, raster = files
+    common = {"data": ["toy"], "licence": "CC0-1.0", "view_elevation": [50, 90]}
+    for place, trained in (("", common), ("untold", {**common, "untold": ["view"]})):
+        toy.lit_sections_model(folder / "suite" / place / "sections.onnx", trained_on=trained)
+        toy.corners_model(folder / "suite" / place / "corners.onnx")
+    with rasterio.open(raster) as source:
+        box, crs = shapely.box(*source.bounds), source.crs
+
+    def planned(elevation, **more):
+        layer = folder / f"r{elevation}.gpkg"
+        table = {"view_azimuth": [181.1, 90.0], "view_elevation": [70.0, elevation]}
+        geopandas.GeoDataFrame(table, geometry=[box, box], crs=crs).to_file(layer)
+        config = {
+            "scene": "s",
+            "raster": str(raster),
+            "dtm": 0,
+            "models": str(folder / "suite"),
+            "regions": str(layer),
+            **more,
+        }
+        ((name, full),) = plan.scenes(config, SCHEMA).items()
+        return plan.plan(name, full, folder, folder / "results")
+
+    assert planned(60.0).models["sections"].path.parent.name == "suite"
+    assert not planned(60.0).warnings
+    with pytest.raises(contract.AngleOutsideTraining, match="25"):
+        planned(25.0)
+    assert planned(25.0, allow_angles=True).warnings
+
+
 def test_another_view_leaves_detection_alone(files):
     """The toy models take no geometry, so angles matter from the plane fit on (and for the truth's frames)."""
     found = changed(files, view_azimuth=90.0)
@@ -136,6 +172,13 @@ def test_a_scenes_own_settings_stand_above_those_for_all_and_below_the_command_l
     assert (found["a"]["models"], found["b"]["models"]) == ("x", "x")
 
 
+def test_a_scene_may_be_called_by_a_number():
+    config = {"scenes": {2024: {"models": "y"}}}
+    for wanted in ({}, {"scene": "2024"}, {"scene": 2024}):
+        found = plan.scenes({**config, **wanted}, SCHEMA)
+        assert {name: own["models"] for name, own in found.items()} == {"2024": "y"}
+
+
 def test_no_scene_at_all():
     with pytest.raises(BadConfig, match="no scene"):
         plan.scenes({"scenes": {}}, SCHEMA)
@@ -184,10 +227,27 @@ def test_what_a_file_stands_for_counts_as_its_content(tmp_path):
     assert fingerprint.of_source(other.parent, cache) == [fingerprint.of_file(f, cache) for f in (other, inner)]
 
 
+def test_what_stands_beside_a_file_counts_as_its_content(tmp_path):
+    """Where a raster without a header lies, and edits that SQLite still keeps beside a GeoPackage."""
+    cache = tmp_path / "cache.json"
+    for name, beside in (("d.asc", "d.prj"), ("p.tif", "p.tfw"), ("t.gpkg", "t.gpkg-wal")):
+        file, more = tmp_path / name, tmp_path / beside
+        file.write_bytes(b"a")
+        alone = fingerprint.of_source(file, cache)
+        more.write_bytes(b"b")
+        before = fingerprint.of_source(file, cache)
+        more.write_bytes(b"other")
+        assert len({str(alone), str(before), str(fingerprint.of_source(file, cache))}) == 3, name
+    (tmp_path / "t.gpkg-wal").write_bytes(b"")
+    assert fingerprint.of_source(tmp_path / "t.gpkg", cache) == fingerprint.of_file(tmp_path / "t.gpkg", cache)
+
+
 def test_edited_sections_and_a_surface_model_start_where_they_are_used(files):
     folder, _ = files
-    for name in ("edit.gpkg", "dsm.tif", "regions.gpkg"):
+    for name in ("edit.gpkg", "dsm.tif"):
         (folder / name).write_bytes(name.encode())
+    table = {"view_azimuth": [170.0], "view_elevation": [60.0]}
+    geopandas.GeoDataFrame(table, geometry=[shapely.box(0, 0, 1, 1)], crs="EPSG:4326").to_file(folder / "regions.gpkg")
     assert changed(files, sections=str(folder / "edit.gpkg")) == {"edited", *AFTER_PLANES}
     assert changed(files, dsm=str(folder / "dsm.tif")) == {"surface", *AFTER_DETECTION}
     assert {"scene", "planes"} <= changed(files, regions=str(folder / "regions.gpkg"))

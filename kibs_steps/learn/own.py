@@ -23,9 +23,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from kibs_steps import cli, evaluate, fingerprint, metrics, store, tiles, truth
+from kibs_steps import cli, evaluate, fingerprint, metrics, sources, store, tiles, truth
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
+from kibs_steps.georeference import SAME_GSD
 from kibs_steps.grid import Window
 from kibs_steps.learn import dataset, guessed
 from kibs_steps.learn.samples import UNKNOWN, Sample
@@ -186,7 +187,7 @@ def teaching(path: str | Path, scene: Scene, side: int) -> Teacher:
     model = contracts.load(path, "sections")
     if model.contract["head"] != "dense":
         raise contracts.ContractMismatch(f"{path} gives no roof probability: --guess takes a dense model for sections")
-    if model.contract["gsd"] != scene.grid.gsd:
+    if abs(scene.grid.gsd / model.contract["gsd"] - 1) > SAME_GSD:
         raise NothingToLearn(
             f"{path} is for {model.contract['gsd']:g} m per px, the tiles are to be of {scene.grid.gsd:g}: give one for that"
         )
@@ -229,10 +230,14 @@ def record_of(
     known = np.concatenate([*heights, np.zeros(0, np.float32)])
     known = known[np.isfinite(known)]
     counts = {name: int((code == i).sum()) for i, name in enumerate(SPLITS)} | {"left_out": int((code < 0).sum())}
-    source = args.truth or args.buildings or args.guess
+    cache = args.out / "fingerprints.json"
     record = {
-        "raster": fingerprint.of_file(args.raster, args.out / "fingerprints.json"),
-        "annotation": fingerprint.of_file(source, args.out / "fingerprints.json"),
+        "raster": sources.content(sources.place(args.raster), cache),
+        "dtm": args.dtm if _is_number(args.dtm) else sources.content(sources.place(args.dtm), cache),
+        "annotation": fingerprint.of_source(args.truth or args.buildings or args.guess, cache),
+        "annotated": fingerprint.of_source(args.annotated, cache) if args.annotated else None,
+        "aoi": fingerprint.of_source(args.aoi, cache) if args.aoi and Path(args.aoi).exists() else args.aoi,
+        "read": [args.bands, args.projection_height, args.truth_frame, args.truth_z],
         "split": {"rule": rule, "seed": args.seed, "shares": SHARES, "tile": args.tile, "tiles": counts}
         | ({"square": args.square, "buffer": args.buffer} if rule == "blocks" else {}),
         "gsd": args.gsd,

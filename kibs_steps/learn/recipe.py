@@ -8,6 +8,7 @@ fine-tuned for: tiles are simulated at its angles (also those that `metadata` te
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,16 +80,17 @@ def _files(named: list[Any]) -> list[str]:
     return [str(f) for f in named if f is not None and Path(str(f)).is_file()]
 
 
-def recipe(config: dict[str, Any], base: Path) -> Recipe:
-    """The recipe of a checked configuration; `base` is the workflow's folder. Raises `BadConfig`."""
+def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Recipe:
+    """The recipe of a checked configuration; `base` is the workflow's folder, keys `told` on the command line stand above those
+    of scenes. Raises `BadConfig`."""
     train = {**DEFAULTS, **(config.get("train") or {})}
     common = {k: v for k, v in config.items() if k in (*OWN, "metadata")}
-    scenes = config.get("scenes") or {}
+    scenes = {str(name): own for name, own in (config.get("scenes") or {}).items()}
 
     def settings_of(name: str, wanted_by: str) -> dict[str, Any]:
-        if name not in scenes and name != config.get("scene"):
+        if name not in scenes and name != str(config.get("scene")):
             raise BadConfig(f"train.{wanted_by}: there is no scene {name!r} in the configuration")
-        return seen({**common, **(scenes.get(name) or {})})
+        return seen({**common, **(scenes.get(name) or {}), **{k: v for k, v in common.items() if k in told}})
 
     def seen(settings: dict[str, Any]) -> dict[str, Any]:
         return {**angles_of(settings), **settings}
@@ -96,7 +98,7 @@ def recipe(config: dict[str, Any], base: Path) -> Recipe:
     own: dict[str, dict[str, Any]] = {}
     for i, item in enumerate(train["own"]):
         item = {"scene": item} if isinstance(item, str) else item
-        given = {**settings_of(item["scene"], "own"), **item} if "scene" in item else seen({**common, **item})
+        given = {**settings_of(item["scene"], "own"), **seen(item)} if "scene" in item else seen({**common, **item})
         name = str(item.get("name", item.get("scene", f"own{i}")))
         if "truth" not in item and ("buildings" in item or "guess" in item):
             given.pop("truth", None)

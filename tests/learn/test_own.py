@@ -2,6 +2,7 @@
 
 import json
 
+import geopandas
 import numpy as np
 import pyogrio
 import pytest
@@ -88,6 +89,21 @@ def test_samples_are_what_the_renderer_shows(city, tmp_path, frame):
     assert {k: v[0] for k, v in again.items()} == {k: v[0] for k, v in samples.items()}
 
 
+def test_whatever_samples_follow_from_is_recorded(city, tmp_path):
+    """By it a training run knows that it would learn from other samples."""
+    folder, _ = city
+    bounds = pyogrio.read_info(folder / "truth.gpkg", layer="sections_image", force_total_bounds=True)["total_bounds"]
+    records = [prepare(city, tmp_path / "own", "--truth", str(folder / "truth.gpkg"))[1]]
+    for part in (0.5, 1.0):
+        place = shapely.box(bounds[0], bounds[1], bounds[0] + part * (bounds[2] - bounds[0]), bounds[3])
+        frame = geopandas.GeoDataFrame(geometry=[place], crs="EPSG:32631")
+        frame.to_file(tmp_path / "annotated.gpkg")
+        options = ["--truth", str(folder / "truth.gpkg"), "--annotated", str(tmp_path / "annotated.gpkg")]
+        records.append(prepare(city, tmp_path / "own", *options)[1])
+    records.append(prepare(city, tmp_path / "own", *options, "--bands=3,2,1")[1])
+    assert len({json.dumps(record) for record in records}) == 4
+
+
 def test_another_split_leaves_no_tile_of_the_one_before(city, tmp_path):
     folder, _ = city
     for options in (["--split=shuffle"], ["--split=shuffle", "--seed=7"]):
@@ -130,6 +146,9 @@ def test_what_a_model_is_sure_of_stands_in_for_an_annotation(tmp_path):
         np.testing.assert_array_equal(sample.rgb[red == 200], image[top : top + 60, left : left + 60][red == 200])
         assert not sample.corners_known.any()
         assert not np.isfinite(sample.height).any()
+    with rasterio.open(raster, "r+") as target:
+        target.transform = target.transform @ target.transform.scale(1.001)  # taken as it is, as everywhere
+    own.main([*words, "--tile=60"])
     for tile, message in ((80, "looks at 64 px"), (500, "a training tile 500 px")):
         with pytest.raises(own.NothingToLearn, match=message):
             own.main([*words, f"--tile={tile}"])

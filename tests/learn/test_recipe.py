@@ -220,3 +220,19 @@ def test_angles_may_come_from_metadata(tmp_path):
 def test_what_cannot_be_trained_is_said(tmp_path, train, message):
     with pytest.raises(BadConfig, match=message):
         recipe.recipe({"scenes": SCENES, "train": train}, tmp_path)
+
+
+def test_an_items_own_metadata_stands_above_its_scenes_angles(tmp_path):
+    item = tmp_path / "other.IMD"
+    item.write_text("meanSatAz = 10;\nmeanSatEl = 80;\n")
+    own = {"scene": "town", "name": "other", "raster": "other.tif", "truth": "o.gpkg", "metadata": str(item)}
+    found = recipe.recipe({"scenes": {"town": TOWN}, "train": {"own": [own]}}, tmp_path).own["other"]
+    assert (found["view_azimuth"], found["view_elevation"], found["dtm"]) == (10.0, 80.0, 100)
+
+
+def test_the_command_line_stands_above_a_scenes_own_keys(tmp_path):
+    config = {"scenes": {"town": TOWN}, "view_elevation": 50.0, "train": {"scene": "town", "own": ["town"]}}
+    for told, elevation in (((), 59.3), (("view_elevation",), 50.0)):
+        found = recipe.recipe(config, tmp_path, told)
+        assert found.own["town"]["view_elevation"] == elevation
+        assert f"--view-elevation={elevation}" in found.training["both"]

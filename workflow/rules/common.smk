@@ -145,22 +145,16 @@ def source(wildcards):
     return "fed" if plan(wildcards).settings["feed"] == "truth" else "detected"
 
 
-def measured(p):
-    """Whether heights come from a surface model, so that the 3D model has nothing to do."""
-    two = p.settings["feed"] == "models" and p.settings["method"] == "two_stage"
-    return two and bool(p.settings.get("dsm"))
-
-
 def found_corners(wildcards):
     """The corners of every block; none where heights come from a surface model."""
-    if measured(plan(wildcards)):
+    if plan(wildcards).measured:
         return []
     return blocks(f"{source(wildcards)}/corners.parquet")(wildcards)
 
 
 def mapped(p):
     """Whether a 3D model gives heights all over the sections, besides corners."""
-    return p.settings["feed"] == "models" and not measured(p)
+    return p.settings["feed"] == "models" and not p.measured
 
 
 def detections(wildcards):
@@ -221,7 +215,7 @@ def kept(p):
             "tiles.tif",
             "sections.tif",
             "detected/pieces.parquet",
-            *([] if measured(p) else ["detected/corners.parquet"]),
+            *([] if p.measured else ["detected/corners.parquet"]),
         ]
     )
     files = [
@@ -255,6 +249,7 @@ def todo(p):
     """How many blocks of a scene each step is still to make, by step."""
     fed = p.settings["feed"] == "truth"
     skipped = ("tiles", "sections", "corners") if fed else ("feed",)
+    skipped += ("corners",) if p.measured else ()
     signed = {step: step for step in BLOCK_FILES}
     signed |= {"ground": "planes", "solids": "solids_of_block"}
     if p.settings["method"] == "single":

@@ -285,7 +285,7 @@ rule stitch:
             f"results/{w.scene}/blocks/{b.name}/{source(w)}"
             for b in plan(w).having("feed")
         ],
-        corners=lambda w: (["--without-corners"] if measured(plan(w)) else [])
+        corners=lambda w: (["--without-corners"] if plan(w).measured else [])
         + (["--with-heights"] if mapped(plan(w)) else []),
         model=lambda w: [f"--model={f}" for f in scored(w)],
     shell:

@@ -4,7 +4,9 @@
 from kibs_steps.learn import recipe as recipes
 
 try:
-    RECIPE = recipes.recipe(config, Path(workflow.basedir))
+    RECIPE = recipes.recipe(
+        config, Path(workflow.basedir), told=workflow.config_settings.config
+    )
     TRAIN = {**recipes.DEFAULTS, **(config.get("train") or {})}
 except KibsError as error:
     raise WorkflowError(str(error)) from None
