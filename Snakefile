@@ -47,7 +47,7 @@ onstart:
 onsuccess:
     for p in PLANS.values():
         if not p.left_out:
-            Path(f"results/{p.name}", failures.RECORD).unlink(missing_ok=True)
+            failures.settle(RESULTS / p.name)
 
 
 onerror:

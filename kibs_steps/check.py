@@ -75,9 +75,9 @@ def tile_seconds(plan: Plan) -> dict[str, float]:
     leans = (d and geometry.lean(d["azimuth"], d["elevation"]) for d in (view, sun))
     told = runtime.geometry_vector(*leans, plan.models["sections"].contract["gsd"])
     for task, model in plan.models.items():
-        if task == "corners" and plan.measured:
-            continue
-        network = runtime.open_network(model, told, looks=settings["looks"])
+        if task == "corners" and (plan.measured or settings["method"] == "single"):
+            continue  # no 3D model is used, or one network gives both
+        network = runtime.open_network(model, told, settings["provider"], settings["threads"], settings["looks"])
         start = time.process_time()
         network(image)
         found[task] = time.process_time() - start
@@ -129,7 +129,11 @@ def page(plan: Plan, results: Path, todo: Mapping[str, int]) -> str:
     jobs = sum(todo.values())
     share = {step: n / len(plan.blocks) for step, n in todo.items()}
     needs = estimate(width * height, rows * cols, share, jobs, networks)
-    models = "none: the truth is fed in their place" if fed else "; ".join(m.licence_line for m in plan.models.values())
+    models = (
+        "none: the truth is fed in their place"
+        if fed
+        else "; ".join(dict.fromkeys(m.licence_line for m in plan.models.values()))
+    )
     waiting = ", ".join(f"{step} {n}" for step, n in todo.items() if n)
     lines = {
         "image": image,

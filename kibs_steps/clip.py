@@ -6,6 +6,8 @@ face is cut along its level line instead, and what lies below it is no roof: the
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterable
 from itertools import pairwise
 
 import numpy as np
@@ -24,19 +26,20 @@ def clipped(faces: list[Face], planes: np.ndarray, low: set[int], lowest: int) -
     Neighbours get the cut's vertices too. Raises `NoPartition` where more than half of a section would go.
     """
     lowest += SPARE
-    cuts: dict[tuple[Point, Point], Point] = {}
+    cuts: dict[tuple[Point, Point], set[Point]] = defaultdict(set)  # of each edge, from both sides
     for face in faces:
         if face.section in low:
             for u, v in _edges(face):
                 away = [shells.height(planes[face.section], p) - lowest for p in (u, v)]
-                if away[0] * away[1] < 0 and (u, v) not in cuts:
+                if away[0] * away[1] < 0:
                     t = away[0] / (away[0] - away[1])
                     cut = (round(u[0] + t * (v[0] - u[0])), round(u[1] + t * (v[1] - u[1])))
-                    cuts[(u, v)] = cuts[(v, u)] = cut
+                    cuts[(u, v)].add(cut)
+                    cuts[(v, u)].add(cut)
     result = []
     for face in faces:
         rings = [
-            [p for u, v in pairwise([*ring, ring[0]]) for p in dict.fromkeys((u, cuts.get((u, v), u)))]
+            [p for u, v in pairwise([*ring, ring[0]]) for p in dict.fromkeys((u, *_along(u, cuts.get((u, v), ()))))]
             for ring in face.rings
         ]
         whole = Face(face.section, rings)
@@ -46,6 +49,11 @@ def clipped(faces: list[Face], planes: np.ndarray, low: set[int], lowest: int) -
     if gone:
         raise NoPartition(f"{1 - after[gone[0]] / before[gone[0]]:.0%} of a section would lie below the ground")
     return result
+
+
+def _along(start: Point, points: Iterable[Point]) -> list[Point]:
+    """Points of an edge in their order from its start."""
+    return sorted(points, key=lambda p: (p[0] - start[0]) ** 2 + (p[1] - start[1]) ** 2)
 
 
 def _edges(face: Face) -> list[tuple[Point, Point]]:

@@ -12,6 +12,7 @@ the layer's z.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -45,26 +46,31 @@ def layer_of(path: str | Path) -> str | None:
 def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Ids (n,), 0 where there is none, and outlines (n,) in image coordinates (px). Raises `SectionsUnusable`."""
     import geopandas
+    import pandas as pd
     import pyogrio
 
     try:
         frame = geopandas.read_file(path, layer=layer_of(path))
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
         raise SectionsUnusable(UNREADABLE.format(path=path, error=error)) from error
-    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])].explode(ignore_index=True)
+    rows = len(frame)
+    frame["row"] = np.arange(rows)
+    frame = frame[frame.geometry.notna()].explode(ignore_index=True)  # collections too, which editing may leave
+    frame = frame[frame.geom_type == "Polygon"]
     if frame.empty:
         raise SectionsUnusable(EMPTY_LAYER.format(path=path))
     if frame.crs is None:
         raise SectionsUnusable(f"sections {path} says no CRS: assign {grid.crs.splitlines()[0]}")
     frame = frame.to_crs(grid.crs)
-    ids = (
-        frame["section_id"].fillna(0).astype(np.int64).to_numpy()
-        if "section_id" in frame
-        else np.zeros(len(frame), np.int64)
-    )
+    own = pd.to_numeric(frame["section_id"], errors="coerce") if "section_id" in frame else pd.Series(0, frame.index)
+    ids = own.fillna(0).clip(0, 2**62).astype(np.int64).to_numpy()
     outlines = shapely.transform(shapely.force_2d(frame.geometry.to_numpy()), grid.to_image)
     outlines = np.array([_polygon(g) for g in outlines], object)
     usable = np.array([g is not None for g in outlines])
+    if not usable.any():
+        raise SectionsUnusable(EMPTY_LAYER.format(path=path))
+    if lost := rows - frame["row"][usable].nunique():
+        print(f"warning: sections {path}: {lost} of {rows} rows have no area and are left out", file=sys.stderr)
     return ids[usable], outlines[usable]
 
 

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps import store
+from kibs_steps import store, sums
 from kibs_steps.errors import AGAIN, KibsError
 from kibs_steps.plan import BLOCK_STEPS, Plan
 
@@ -77,11 +77,10 @@ def publish_rest(
     found: list[Failure], plans: dict[str, Plan], argv: list[str], config: dict[str, Any], results: Path
 ) -> bool:
     """Publish every scene without its failed blocks; whether that was worth trying and went well."""
-    lost = [f for f in found if f.of_block]
-    by_scene = Counter(f.scene for f in lost)
+    gone = wholly_lost(found, plans)
+    lost = [f for f in found if f.of_block and f.scene not in gone]
+    by_scene = {f.scene for f in lost}
     if not lost or any(f.scene in by_scene and not f.of_block for f in found):
-        return False
-    if all(by_scene[name] + len(p.left_out) >= len(p.blocks) for name, p in plans.items() if name in by_scene):
         return False
     leave_out = [f"{name}/{block}/{step}" for name, p in plans.items() for block, step in p.left_out.items()]
     for name in by_scene:
@@ -91,16 +90,34 @@ def publish_rest(
         store.write_json(path, dict(sorted(known.items())))
         leave_out += [f"{f.scene}/{f.block}/{f.step}" for f in lost if f.scene == name]
     print("Some blocks failed: the rest of the city is published without them.", file=sys.stderr, flush=True)
-    subprocess.run(command(argv, config, leave_out), check=False)
+    # A scene of which nothing is left is not tried again: of several the others are made one by one.
+    for only in [{"scene": name} for name in plans if name not in gone] if gone else [{}]:
+        subprocess.run(command(argv, {**config, **only}, leave_out), check=False)
     # That run fails too where it lost blocks of its own and published the rest without them: the record tells.
     return all(_published(results / name) for name in by_scene)
+
+
+def settle(folder: Path) -> None:
+    """Forget which blocks of a scene failed once what is published is made with all of them."""
+    try:
+        whole = not store.read_json(folder / "run.json")["failed_blocks"]
+    except (OSError, KibsError, KeyError):
+        return
+    if whole:
+        sums.discard(folder / RECORD)
+
+
+def wholly_lost(found: list[Failure], plans: dict[str, Plan]) -> set[str]:
+    """The scenes of which no block is left."""
+    lost = Counter(f.scene for f in found if f.of_block)
+    return {name for name, p in plans.items() if lost[name] and lost[name] + len(p.left_out) >= len(p.blocks)}
 
 
 def _published(folder: Path) -> bool:
     """Whether what is published says itself that it is made without the blocks that failed."""
     try:
         record = store.read_json(folder / "run.json")
-        return list(record["failed_blocks"]) == list(store.read_json(folder / RECORD))
+        return record["failed_blocks"] == store.read_json(folder / RECORD)
     except KibsError:
         return False
 
@@ -112,9 +129,11 @@ def told(found: list[Failure], published: bool, plans: dict[str, Plan], results:
         where = " ".join(part for part in (f.scene, f.block) if part)
         log = f" (log: {f.log})" if f.log else ""
         lines.append(f"error: {where + ', ' if where else ''}{f.step}: {f.reason}{log}")
-    lost = sum(f.of_block for f in found)
+    gone = wholly_lost(found, plans)
+    lost = sum(f.of_block and f.scene not in gone for f in found) if published else sum(f.of_block for f in found)
     if published:
-        total = sum(len(plans[name].blocks) for name in {f.scene for f in found if f.of_block})
+        lines += [f"error: {name}: all its blocks failed, so nothing of it is published" for name in sorted(gone)]
+        total = sum(len(plans[name].blocks) for name in {f.scene for f in found if f.of_block} - gone)
         lines.append(
             f"{lost} of {total} blocks failed; the rest of the city is published in {results}/, with these blocks marked in "
             "layer `blocks` of city.gpkg and in run.json. Run the same command again to try them again."

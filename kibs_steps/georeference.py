@@ -160,6 +160,10 @@ def _bounds_of(aoi: str | Path, crs: str) -> np.ndarray:
         ) from error
     shapes = shapely.from_wkb(shapes) if shapes is not None else np.zeros(0, object)
     points = shapely.get_coordinates(shapes)
+    if (
+        len(points) > 1 and (extent := np.ptp(points, axis=0).max()) > 0
+    ):  # what is straight in one CRS is bent in another
+        points = shapely.get_coordinates(shapely.segmentize(shapes, extent / 256))
     if not len(points):
         raise AoiUnusable(f"aoi {aoi} holds no shape in its first layer: draw one, or leave aoi out")
     if facts["crs"] is None:

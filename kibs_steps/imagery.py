@@ -211,7 +211,7 @@ def nodata_of(source: rasterio.DatasetReader) -> float | None:
     """
     if source.nodata is not None:
         return float(source.nodata) if np.isfinite(source.nodata) else float("nan")
-    if _masked(source) or source.dtypes[0] in ("uint8", "int8"):
+    if _masked(source) or _alpha(source) is not None or source.dtypes[0] in ("uint8", "int8"):
         return None
     return 0.0 if np.issubdtype(source.dtypes[0], np.integer) else float("nan")
 

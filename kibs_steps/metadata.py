@@ -55,7 +55,7 @@ def read(path: str | Path) -> Angles:
     if not path.is_file():
         raise MetadataUnusable(f"metadata {path} is not there: give the vendor's .IMD, .XML, STAC .json or RPC file")
     head = path.read_bytes()[:4096] if path.stat().st_size else b""
-    text = path.read_text(encoding="utf-8", errors="replace") if _is_text(head, path) else None
+    text = path.read_text(encoding="utf-8-sig", errors="replace") if _is_text(head, path) else None
     if text is None:
         found = of_rpc(*_raster_rpc(path))
     elif text.lstrip().startswith("{"):

@@ -20,6 +20,7 @@ from kibs_steps.scene import Scene
 
 AT_ONCE = 2048  # px: side of what is read of a raster at once
 SOME = 4096  # outlines that are points at once
+NARROWEST = 880  # px: a page that its legends fit on
 FINER = 2  # how much larger than the result everything is drawn
 INK, PAPER, QUIET = (38, 42, 46), (250, 249, 246), (122, 128, 134)
 HEIGHTS = np.array(  # dark blue over green to pale yellow: even steps of lightness, safe for colour-blind eyes
@@ -155,7 +156,7 @@ def sheet(panels: list[Image.Image], titles: list[str], head: str, note: str, fo
     for panel in panels:
         place.append((x, y))
         x, y = (x + panel.width + gap, y) if beside else (x, y + panel.height + caption + gap)
-    width = max(px + panel.width for (px, _), panel in zip(place, panels, strict=True)) + gap
+    width = max(NARROWEST, *(px + panel.width + gap for (px, _), panel in zip(place, panels, strict=True)))
     height = max(py + panel.height for (_, py), panel in zip(place, panels, strict=True)) + caption + foot
     picture = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(picture)

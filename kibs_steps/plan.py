@@ -42,6 +42,7 @@ DEFAULTS = {
     "suppose": False,
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
+NAMED = ("truth", "sections", "regions", "footprints", "dsm", "aoi", "metadata")  # settings that are files
 TASKS = {"two_stage": ("sections", "corners"), "single": ("both",)}
 PAPER_MODE = {"planes": "paper"}  # besides the stride and the rule at seams
 REACH = 7.5  # px: half the paper's corner square q = 15, unless the model's contract says otherwise
@@ -79,6 +80,12 @@ class Plan(NamedTuple):
         except ValueError:
             return sources.files(self.dtm)
         return []
+
+    @property
+    def named_files(self) -> list[str]:
+        """The files that settings name besides raster and terrain."""
+        named = [str(self.settings[key]) for key in NAMED if self.settings.get(key)]
+        return [path for path in named if Path(path).exists()]
 
     @property
     def remote(self) -> list[str]:
@@ -124,13 +131,16 @@ def scenes(config: dict[str, Any], schema: dict[str, Any], told: Collection[str]
     user_settings.check(config, schema)
     common = {k: v for k, v in config.items() if k not in RUN_KEYS}
     listed = {str(name): own for name, own in (config.get("scenes") or {}).items()}
-    wanted = [str(config["scene"])] if config.get("scene") else list(listed)
+    wanted = [str(config["scene"])] if config.get("scene") not in (None, "") else list(listed)
     if not wanted:
         raise BadConfig(
             "no scene to build: add one under `scenes:` in config.yaml, or give --config scene=NAME raster=FILE"
         )
     last = {k: v for k, v in common.items() if k in told}
-    return {name: {**DEFAULTS, **common, **(listed.get(name) or {}), **last} for name in wanted}
+    return {
+        name: {**DEFAULTS, **with_angles(common), **with_angles(listed.get(name) or {}), **with_angles(last)}
+        for name in wanted
+    }
 
 
 def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan:
@@ -140,7 +150,7 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
-    settings = {**angles_of(settings), **settings}
+    settings = with_angles(settings)
     if settings["mode"] == "paper":
         settings = {**settings, **PAPER_MODE}
     models = models_for(settings, base)
@@ -154,6 +164,8 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     if simulated is not None:
         simulated = {**SIMULATED, **simulated}
         settings = {**settings, "simulate": simulated}
+        if settings.get("aoi"):
+            raise BadConfig(f"scene {name}: a simulated scene is as large as simulate.size says: leave out aoi")
         for key in ("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"):
             if key not in settings:
                 raise BadConfig(f"scene {name}: a simulated scene needs {key}")
@@ -212,6 +224,11 @@ def angles_of(settings: dict[str, Any]) -> dict[str, float]:
     from kibs_steps import metadata
 
     return {key: value for key, value in metadata.read(settings["metadata"])._asdict().items() if value is not None}
+
+
+def with_angles(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of one place, with the angles that their `metadata` tells and they do not say themselves."""
+    return {**angles_of(settings), **settings}
 
 
 def direction(settings: dict[str, Any], name: str) -> dict[str, float] | None:
@@ -321,6 +338,8 @@ def signatures(
 
     angles = [some("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"), content("regions")]
     seen: dict[str, Any] = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
+    # A contract may stand in a file of its own beside the network.
+    known = {task: [m.sha256, m.contract] for task, m in models.items()}
     s = {"source": h(version("kibs-steps"), source)}
     s["scene"] = h(
         s["source"],
@@ -332,26 +351,26 @@ def signatures(
     s["truth"] = h(s["scene"], truth, some("truth_frame", "truth_z"))
     s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
-        s[f"model_{task}"] = h(model.sha256, str(model.path))
+        s[f"model_{task}"] = h(*known[task], str(model.path))
     inference = some("provider", "threads", "looks")  # sums in another order differ in their last bits
     if supposes(settings, models):
-        s["supposed"] = h(s["tiles"], models["sections"].sha256, angles, inference)
+        s["supposed"] = h(s["tiles"], known["sections"], angles, inference)
         seen = {task: told and [told, s["supposed"]] for task, told in seen.items()}
-    s["sections"] = h(s["tiles"], models["sections"].sha256, seen["sections"], settings["mode"], inference)
-    s["blend"] = h(s["sections"], models["corners"].sha256)
+    s["sections"] = h(s["tiles"], known["sections"], seen["sections"], settings["mode"], inference)
+    s["blend"] = h(s["sections"], known["corners"])
     s["corners"] = h(s["blend"], seen["corners"], inference)
     s["single"] = h(s["sections"])
     s["feed"] = h(s["truth"], tiling)
     # The corner model says how far corners may lie from their section, also where the truth is fed.
     detected = s["single" if settings["method"] == "single" else "sections" if settings.get("dsm") else "corners"]
     detected = s["feed"] if settings["feed"] == "truth" else detected
-    s["stitch"] = h(detected, models["corners"].sha256, settings["mode"], without(*DETECTING))
+    s["stitch"] = h(detected, known["corners"], settings["mode"], without(*DETECTING))
     s["edited"] = h(s["stitch"], s["scene"], content("sections")) if settings.get("sections") else s["stitch"]
     s["surface"] = h(s["scene"], content("dsm"))
     s["planes"] = h(
         s["edited"],
         s["scene"],
-        models["corners"].sha256,
+        known["corners"],
         settings["planes"],
         s["surface"] if settings.get("dsm") else None,
     )
@@ -360,5 +379,7 @@ def signatures(
     s["solids"] = h(s["solids_of_block"], without("solids"))
     s["evaluate"] = h(s["planes"], s["truth"], without(*STANDING))
     s["glb"] = h(s["solids"], settings["drape"])
-    s["run"] = h(s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str))
+    s["run"] = h(
+        s["solids"], s["evaluate"], json.dumps(settings, sort_keys=True, default=str), [content(key) for key in NAMED]
+    )
     return s

@@ -15,6 +15,7 @@ In: stitched sections and corners, DTM, view. Out: `planes.parquet`, `filed_corn
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
@@ -100,25 +101,33 @@ class Fit(NamedTuple):
 
 
 def file_corners(
-    outlines: np.ndarray, corners: np.ndarray, owner: np.ndarray, owners: np.ndarray, reach: float, shared: float
+    outlines: np.ndarray,
+    corners: np.ndarray,
+    owner: np.ndarray,
+    owners: np.ndarray,
+    reach: float,
+    shared: float,
+    others: Sequence[shapely.Geometry] = (),
 ):
     """Which corners belong to which section: arrays (section index, corner index), sorted.
 
     A corner goes to the sections whose rim is nearest: within `reach` px, and within `shared` px of the nearest one, so
     neighbours on a ridge both get it and a section further off does not (0 gives it to the nearest alone, which several are
-    that meet in one rim). `corners` (n, 2) px. Corners with an owner go to the section of that owner alone.
+    that meet in one rim). `corners` (n, 2) px. Corners with an owner go to the section of that owner alone. `others` are
+    outlines of sections that are not asked about here, but may be nearer.
     """
     if not len(outlines) or not len(corners):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     points = shapely.points(corners)
     free = np.flatnonzero(owner == 0)
-    tree = shapely.STRtree(shapely.boundary(outlines))
+    rims = shapely.boundary(np.concatenate([outlines, np.array(others, object)]))
+    tree = shapely.STRtree(rims)
     corner, section = tree.query(points[free], predicate="dwithin", distance=reach)
     corner = free[corner]
-    distance = shapely.distance(points[corner], shapely.boundary(outlines)[section])
+    distance = shapely.distance(points[corner], rims[section])
     nearest = np.full(len(corners), np.inf)
     np.minimum.at(nearest, corner, distance)
-    keep = distance <= nearest[corner] + shared
+    keep = (distance <= nearest[corner] + shared) & (section < len(outlines))
     corner, section = corner[keep], section[keep]
     at = {int(o): i for i, o in enumerate(owners) if o}
     owned = np.array([(at[int(o)], i) for i, o in enumerate(owner) if o and int(o) in at], np.int64).reshape(-1, 2)
@@ -316,17 +325,18 @@ def planes(
     fallback: tuple[float, float],
     reach: float,
     rule: str,
+    others: Sequence[shapely.Geometry] = (),
 ) -> tuple[pa.Table, pa.Table]:
     """Sections with planes, and corners filed to them (one row per pair), both sorted by section.
 
-    `reach` px; `fallback` (mean height, σ) m.
+    `reach` px; `fallback` (mean height, σ) m; `others` outlines (px) of sections round about, whose corners may lie near these.
     """
     outlines = shapely.from_wkb(sections["outline"].to_numpy(zero_copy_only=False))
     pixel = np.stack([corners["col"].to_numpy(), corners["row"].to_numpy()], axis=1)
     base = facts.projected_on(dtm)
     shared = SHARED if rule == "robust" else 0.0
     section, corner = file_corners(
-        outlines, pixel, corners["owner"].to_numpy(), sections["owner"].to_numpy(), reach, shared
+        outlines, pixel, corners["owner"].to_numpy(), sections["owner"].to_numpy(), reach, shared, others
     )
     centre = middle_of(outlines, facts)
     lean = facts.leans(centre)
@@ -409,9 +419,18 @@ def main(argv: list[str] | None = None) -> None:
         from kibs_steps import surface
 
         sections, corners = surface.under(sections, facts, args.surface, dtm)
-    table, filed = planes(sections, corners, facts, dtm, fallback, args.reach, args.rule)
+    round_about = (store.read_table(args.sections, ["outline"], block=name) for name in neighbours(args.name))
+    others = [outline for table in round_about for outline in shapely.from_wkb(table["outline"].to_numpy())]
+    table, filed = planes(sections, corners, facts, dtm, fallback, args.reach, args.rule, others)
     store.write_table(args.planes, table)
     store.write_table(args.filed, filed)
+
+
+def neighbours(name: str) -> list[str]:
+    """The names of the eight blocks about one."""
+    row, col = map(int, name[1:].split("c"))
+    steps = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
+    return [f"r{row + r:03d}c{col + c:03d}" for r, c in steps if row + r >= 0 and col + c >= 0]
 
 
 def middle_of(outlines: np.ndarray, facts: scene.Scene) -> np.ndarray:

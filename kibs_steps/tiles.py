@@ -109,6 +109,7 @@ def on_grid(source: rasterio.DatasetReader, grid: Grid, nodata: float | None) ->
         src_nodata=nodata,
         add_alpha=ColorInterp.alpha not in source.colorinterp,
         UNIFIED_SRC_NODATA="YES",
+        SRC_ALPHA_MAX="1",  # any alpha above 0 is data, whatever the type's greatest value
         XSCALE=scale_x,
         YSCALE=scale_y,
     )

@@ -8,6 +8,7 @@ again; a published file is set aside as NAME.changed, because a user may have ed
 from __future__ import annotations
 
 import argparse
+import itertools
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,6 +21,7 @@ INTERMEDIATE = ("blocks", "stitched", "edited", "models", "simulated")
 ALONE = ("scene.json", "dtm.tif", "supposed.json", "surface.tif", "truth.parquet", "buildings.parquet")
 OTHERS = ("logs", "benchmarks")  # folders whose files nobody reads back
 ASIDE = ".changed"
+TILES = "tiles3d"
 
 
 class Damaged(KibsError):
@@ -64,8 +66,16 @@ def mend(found: Iterable[Finding], folder: Path) -> None:
     """Take damaged files away, so that the next run makes them again; published ones are kept as NAME.changed."""
     for path, _ in found:
         if path.exists() and not intermediate(path, folder):
-            path.replace(path.with_name(path.name + ASIDE))
+            path.replace(aside(path))
         sums.discard(path)
+        if path.parent.name == TILES:  # which are made together with their list, that alone is asked for
+            sums.discard(path.with_name("tileset.json"))
+
+
+def aside(path: Path) -> Path:
+    """A free name to keep a published file under: NAME.changed, else NAME.2.changed, and so on."""
+    endings = itertools.chain([ASIDE], (f".{number}{ASIDE}" for number in itertools.count(2)))
+    return next(name for ending in endings if not (name := path.with_name(path.name + ending)).exists())
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -78,7 +88,7 @@ def main(argv: list[str] | None = None) -> None:
     for folder in map(Path, args.folders):
         found, read = findings(folder, args.temporary) if folder.is_dir() else ([], 0)
         for leftover in list(folder.rglob(".tmp-*")):
-            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+            shutil.rmtree(leftover, ignore_errors=True) if leftover.is_dir() else leftover.unlink(missing_ok=True)
         mend(found, folder)
         lines += [f"  {path}: {what}" for path, what in found]
         total += read

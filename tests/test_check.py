@@ -38,7 +38,7 @@ def test_only_what_a_run_does_is_timed(tmp_path, monkeypatch):
     config = {**cases.good(tmp_path), "dtm": 30, "looks": 1}
     seen = []
 
-    def spy(model, geometry, looks):
+    def spy(model, geometry, provider, threads, looks):
         seen.append((model.contract["task"], geometry.round(3).tolist()[0], looks))
         return lambda rgb: {}
 

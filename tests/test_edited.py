@@ -10,6 +10,7 @@ import toy_city
 
 from kibs_steps import edited, store
 from kibs_steps.corners import CORNERS
+from kibs_steps.grid import Grid
 from kibs_steps.heightmap import EMPTY
 from kibs_steps.stitch import SECTIONS, section_ids
 
@@ -132,3 +133,25 @@ def test_a_bowtie_becomes_its_larger_part(world):
     assert spiked.is_valid
     assert spiked.area == pytest.approx(25.0)
     assert grid.width == toy_city.WIDTH
+
+
+def test_rows_that_editing_left_odd_are_kept_or_told(tmp_path, capsys):
+    """A polygon within a collection is a section, a new one may have a word for its id, what has no area is told."""
+    grid = Grid("EPSG:32631", 590_000.0, 5_750_000.0, 0.5, 320, 240)
+
+    def box(col, row):
+        return shapely.Polygon(
+            grid.to_map(np.array([[col, row], [col + 20, row], [col + 20, row + 20], [col, row + 20]]))
+        )
+
+    line = shapely.Polygon([(590_010, 5_749_990), (590_020, 5_749_990), (590_030, 5_749_990)])
+    mixed = shapely.GeometryCollection([box(10, 10), shapely.Point(590_000, 5_749_990)])
+    table = {"section_id": ["10000", "new", "7"]}
+    geopandas.GeoDataFrame(table, geometry=[mixed, box(50, 50), line], crs=grid.crs).to_file(tmp_path / "a.gpkg")
+    ids, outlines = edited.read(tmp_path / "a.gpkg", grid)
+    assert ids.tolist() == [10000, 0]
+    assert shapely.area(outlines).round(6).tolist() == [400, 400]
+    assert "1 of 3 rows have no area" in capsys.readouterr().err
+    geopandas.GeoDataFrame(geometry=[line], crs=grid.crs).to_file(tmp_path / "b.gpkg")
+    with pytest.raises(edited.SectionsUnusable, match="no polygons"):
+        edited.read(tmp_path / "b.gpkg", grid)

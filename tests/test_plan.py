@@ -1,9 +1,11 @@
 """Plans: configuration to scenes, and signatures that change exactly where content changes."""
 
+import json
 from pathlib import Path
 
 import geopandas
 import numpy as np
+import onnx
 import pytest
 import rasterio
 import shapely
@@ -66,6 +68,22 @@ def test_another_corner_model_leaves_sections_alone(files):
         "corners",
         *AFTER_DETECTION,
     }
+
+
+def test_a_contract_beside_its_network_counts_as_its_content(files):
+    folder, _ = files
+    network = folder / "a/sections.onnx"
+    model = onnx.load(network)
+    terms = {p.key: p.value for p in model.metadata_props}[contract.KEY]
+    del model.metadata_props[:]
+    onnx.save(model, network)
+    network.with_suffix(".json").write_text(terms)
+    before = make(files).signature
+    other = json.loads(terms)
+    other["thresholds"]["min_area"] = 1000
+    network.with_suffix(".json").write_text(json.dumps(other))
+    after = make(files).signature
+    assert {"model_sections", "sections", "stitch"} <= {step for step in before if before[step] != after[step]}
 
 
 def test_supposing_takes_a_set_that_can_be_told(files):
@@ -157,6 +175,11 @@ def test_bad_configuration(files, settings, message):
         make(files, **settings)
 
 
+def test_a_simulated_scene_has_no_aoi(files):
+    with pytest.raises(BadConfig, match="leave out aoi"):
+        make(files, simulate={"seed": 1}, aoi="a.gpkg", sun_azimuth=150.0, sun_elevation=45.0)
+
+
 def test_simulated_scene_needs_angles(files):
     config = {"scenes": {"d": {"simulate": {"seed": 1, "size": 200}, "models": str(files[0] / "a")}}}
     ((name, full),) = plan.scenes(config, SCHEMA).items()
@@ -177,6 +200,7 @@ def test_a_scene_may_be_called_by_a_number():
     for wanted in ({}, {"scene": "2024"}, {"scene": 2024}):
         found = plan.scenes({**config, **wanted}, SCHEMA)
         assert {name: own["models"] for name, own in found.items()} == {"2024": "y"}
+    assert list(plan.scenes({"scene": 0, "scenes": {0: {}, "b": {}}}, SCHEMA)) == ["0"]
 
 
 def test_no_scene_at_all():
@@ -263,6 +287,19 @@ def test_angles_come_from_metadata(files):
     ((_, full),) = plan.scenes({"scene": "s", "raster": str(files[1]), "dtm": 0, "models": str(folder / "a"),
                                 "metadata": str(folder / "a.IMD"), **config}, SCHEMA).items()  # fmt: skip
     assert plan.plan("s", full, folder, folder / "results").settings["view_azimuth"] == 181.1
+
+
+def test_metadata_stands_where_it_is_given(files):
+    """Told on the command line it stands above a scene's own angles, a scene's own above those for all."""
+    folder, _ = files
+    (folder / "a.IMD").write_text("meanSatAz = 280;\nmeanSatEl = 70;\n", encoding="utf-8-sig")
+    own = {"metadata": str(folder / "a.IMD")}
+    for config, told, azimuth in (
+        ({**own, "scenes": {"s": {"view_azimuth": 10.0}}}, (), 10.0),
+        ({**own, "scenes": {"s": {"view_azimuth": 10.0}}}, ("metadata",), 280.0),
+        ({"view_azimuth": 10.0, "scenes": {"s": own}}, (), 280.0),
+    ):
+        assert plan.scenes(config, SCHEMA, told)["s"]["view_azimuth"] == azimuth
 
 
 def test_a_simulated_city_reruns_with_its_file(files):

@@ -222,3 +222,13 @@ def test_plane_that_dives_into_the_ground_is_made_level():
     assert result.status == "implausible_height"
     assert (result.plane.a, result.plane.b) == (0, 0)
     assert planes.checked(found, on_plane(SQUARE).height, 400.0, 0.0, MIDDLE, RIM, False, False).status == "ok"
+
+
+def test_a_corner_on_a_neighbours_rim_is_the_neighbours_even_where_that_is_not_asked_about():
+    mine, other = shapely.box(60, 30, 94, 60), shapely.box(97, 30, 130, 60)
+    corners, free = np.array([[97.0, 30.0], [97.0, 60.0]]), np.zeros(2, int)
+    together = planes.file_corners(np.array([mine, other]), corners, free, np.zeros(2, int), 6.0, 2.0)
+    assert together[0].tolist() == [1, 1]
+    alone = planes.file_corners(np.array([mine]), corners, free, np.zeros(1, int), 6.0, 2.0, [other])
+    assert len(alone[0]) == 0
+    assert planes.neighbours("r000c001") == ["r000c000", "r000c002", "r001c000", "r001c001", "r001c002"]

@@ -13,7 +13,8 @@ import toy_city
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kibs_steps import features, gate, solids, store, terrain
+from kibs_steps import clip, features, gate, shells, solids, store, terrain
+from kibs_steps.faces import Face
 from kibs_steps.shells import GROUND, ROOF, WALL
 from kibs_steps.stitch import simplified
 
@@ -194,6 +195,19 @@ def test_a_cut_may_leave_several_parts():
     assert solid.lod == "2.0"
     assert shells_are_valid(solid)
     assert solid.base.bounds[1] == pytest.approx(2.0, abs=0.01)
+
+
+def test_neighbours_that_both_dive_are_both_cut():
+    """Two faces share an edge at different heights: each is cut where its own plane comes down, whichever is first."""
+    squares = [
+        [(0, 0), (10_000, 0), (10_000, 10_000), (0, 10_000)],
+        [(10_000, 0), (20_000, 0), (20_000, 10_000), (10_000, 10_000)],
+    ]
+    both = [Face(k, [ring]) for k, ring in enumerate(squares)]
+    planes = np.array([[0, 0.1, 0.2], [0, 0.1, 0.1]])
+    for order in (both, both[::-1]):
+        for face in clip.clipped(order, planes, {0, 1}, 500):
+            assert min(shells.height(planes[face.section], p) for p in face.rings[0]) >= 499
 
 
 def test_a_roof_mostly_below_ground_is_made_level_and_told():

@@ -295,3 +295,24 @@ class TestCommandLine:
         made = build(tmp_path, rasters.write(tmp_path / "a.tif", rasters.picture()))
         with pytest.raises(tiles.NoSuchBlock, match="r000c000 to r001c002"):
             tiles.read_block(made, TILING, TILING.block_of("r002c000"))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "alpha", "nodata"),
+    [("float32", 1, None), ("float32", 0.5, None), ("float32", 255, -9999), ("uint16", 1, 0), ("uint8", 255, None)],
+)
+def test_any_alpha_above_nothing_is_data_when_resampled_too(tmp_path, dtype, alpha, nodata):
+    """A sixteenth of the raster is transparent; whatever number the others hold, they are data."""
+    values = np.random.default_rng(0).uniform(0.1, 0.9, (4, 160, 160)) * (1 if dtype == "float32" else 200)
+    values = values.astype(dtype)
+    values[3] = alpha
+    values[3, 40:80, 40:80] = 0
+    names = ("red", "green", "blue", "alpha")
+    told = {
+        "colours": [rasterio.enums.ColorInterp[name] for name in names],
+        **({} if nodata is None else {"nodata": nodata}),
+    }
+    path = rasters.write(tmp_path / "a.tif", values, gsd=0.4, **told)
+    facts, _ = rasters.build(tmp_path, path, "10", gsd=0.5)
+    _, valid = tiles.read_window(facts, Window(0, 0, facts.grid.width, facts.grid.height))
+    assert valid.mean() == pytest.approx(15 / 16, abs=0.01)

@@ -12,7 +12,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps.plan import BadConfig, angles_of, folder_of
+from kibs_steps.plan import BadConfig, folder_of, with_angles
 
 DEFAULTS = {
     "name": "mine",
@@ -76,29 +76,30 @@ class Recipe(NamedTuple):
 
 
 def _files(named: list[Any]) -> list[str]:
-    """Of inputs those that are files that are there."""
-    return [str(f) for f in named if f is not None and Path(str(f)).is_file()]
+    """Of inputs those that are files or folders that are there."""
+    return [str(f) for f in named if f is not None and Path(str(f)).exists()]
 
 
 def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Recipe:
     """The recipe of a checked configuration; `base` is the workflow's folder, keys `told` on the command line stand above those
     of scenes. Raises `BadConfig`."""
     train = {**DEFAULTS, **(config.get("train") or {})}
-    common = {k: v for k, v in config.items() if k in (*OWN, "metadata")}
+    common = {k: v for k, v in config.items() if k in (*OWN, "metadata", "regions")}
     scenes = {str(name): own for name, own in (config.get("scenes") or {}).items()}
 
     def settings_of(name: str, wanted_by: str) -> dict[str, Any]:
         if name not in scenes and name != str(config.get("scene")):
             raise BadConfig(f"train.{wanted_by}: there is no scene {name!r} in the configuration")
-        return seen({**common, **(scenes.get(name) or {}), **{k: v for k, v in common.items() if k in told}})
-
-    def seen(settings: dict[str, Any]) -> dict[str, Any]:
-        return {**angles_of(settings), **settings}
+        # What the command line says of one scene is not meant for another.
+        meant = config.get("scene") in (None, "") or name == str(config["scene"])
+        last = {k: v for k, v in common.items() if meant and k in told}
+        return {**with_angles(common), **with_angles(scenes.get(name) or {}), **with_angles(last)}
 
     own: dict[str, dict[str, Any]] = {}
     for i, item in enumerate(train["own"]):
         item = {"scene": item} if isinstance(item, str) else item
-        given = {**settings_of(item["scene"], "own"), **seen(item)} if "scene" in item else seen({**common, **item})
+        before = settings_of(item["scene"], "own") if "scene" in item else with_angles(common)
+        given = {**before, **with_angles(item)}
         name = str(item.get("name", item.get("scene", f"own{i}")))
         if "truth" not in item and ("buildings" in item or "guess" in item):
             given.pop("truth", None)

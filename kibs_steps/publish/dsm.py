@@ -1,8 +1,9 @@
 """DSM: `dsm.tif`, terrain and buildings as one surface, in the map frame.
 
 In: the scene, its terrain, the blocks' meshes. Out: absolute heights (m, float32), a Cloud Optimized GeoTIFF with the grid's
-pixels laid over where things *stand*: a pixel has the height of the highest roof over its centre, else of the terrain. What was
-moved beyond the raster's edge is cut off. Pixels are worked on in windows, so memory does not grow with the raster.
+pixels laid over where things *stand*: a pixel has the height of the highest roof over its centre, or of the terrain where
+that is higher. What was moved beyond the raster's edge is cut off. Pixels are worked on in windows, so memory does not grow
+with the raster.
 """
 
 from __future__ import annotations

@@ -42,10 +42,11 @@ def draped(glb: Glb, mesh: Mesh, base: np.ndarray, scene: Scene, dtm: view.Surfa
     roof = mesh.kind[mesh.face] == 0
     corners = mesh.triangles[roof].reshape(-1, 3)
     lean = np.zeros((len(corners), 2))
-    if len(corners):  # of each roof face as a whole, as it was found
-        face = np.repeat(np.unique(mesh.face[roof], return_inverse=True)[1], 3)
-        middle = np.column_stack([np.bincount(face, values) for values in corners.T]) / np.bincount(face)[:, None]
-        lean = scene.leans_of(middle, dtm)[face]
+    if len(corners):  # of each section as a whole, as it was moved
+        section = [surface.get("section_id", -1 - number) for number, surface in enumerate(mesh.surfaces)]
+        of = np.unique(np.array(section)[mesh.face[roof]], return_inverse=True)[1].repeat(3)
+        middle = np.column_stack([np.bincount(of, values) for values in corners.T]) / np.bincount(of)[:, None]
+        lean = scene.leans_of(middle, dtm)[of]
     seen = view.image_position(corners[:, :2], corners[:, 2], lean, scene.projected_on(dtm))
     uv = scene.grid.to_image(seen) / (scene.grid.width, scene.grid.height)
     place = glb.accessor("image positions", uv.astype(np.float32))

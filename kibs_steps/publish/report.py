@@ -50,10 +50,12 @@ def page(run: Mapping[str, Any], evaluation: Mapping[str, Any] | None, pictures:
         parts.append('<p class="bad">The city is made without the blocks that failed.</p>')
     parts.append(table("Blocks that failed", failed))
     area = grid["width"] * grid["height"] * grid["gsd"] ** 2 / 1e6
-    view = scene["view"]
+    view, regions = scene["view"], scene.get("regions")
+    seen = [f"azimuth {view['azimuth']:g}°, elevation {view['elevation']:g}°"] if view else []
+    seen += [f"{len(regions)} regions with views of their own"] if regions else []
     facts = {
         "grid": f"{grid['width']} x {grid['height']} px of {grid['gsd']:g} m, {area:.2f} km²",
-        "view": f"azimuth {view['azimuth']:g}°, elevation {view['elevation']:g}°" if view else "unknown",
+        "view": " and ".join(seen) or "unknown",
         "roofs moved to where they stand": "yes" if scene["position_corrected"] else "no",
     }
     parts.append(table("Scene", facts))

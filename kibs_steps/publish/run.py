@@ -203,6 +203,7 @@ def facts(scene: Scene) -> dict[str, Any]:
         "view": scene.view and scene.view._asdict(),
         "sun": scene.sun and scene.sun._asdict(),
         "projection_height": scene.projection_height,
+        "regions": [region.view._asdict() for region in scene.regions],
         "position_corrected": scene.view is not None or bool(scene.regions),
     }
 

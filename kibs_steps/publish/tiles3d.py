@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from kibs_steps import cli, georeference, store
+from kibs_steps import cli, georeference, store, verify
 from kibs_steps import scene as scenes
 from kibs_steps.mesh import COLOURS, Mesh, by_kind, read
 from kibs_steps.publish import licences
@@ -173,6 +173,8 @@ def main(argv: list[str] | None = None) -> None:
     shutil.rmtree(making, ignore_errors=True)
     making.mkdir(parents=True)
     write(making, squares(args.meshes), earth, {"extras": {k: v for k, v in told.items() if v}})
+    for kept in folder.glob(f"*{verify.ASIDE}"):  # what a user changed and `verify` set aside
+        kept.rename(making / kept.name)
     shutil.rmtree(folder, ignore_errors=True)
     making.rename(folder)
 

@@ -60,6 +60,39 @@ def test_nothing_to_publish(nested, tmp_path, found):
     assert "is published" not in failures.told(found, False, {"town": TOWN}, tmp_path)
 
 
+def test_a_scene_of_which_nothing_is_left_spoils_no_other(nested, tmp_path):
+    """Town loses one of two blocks, hut its only one: town is published, hut is told and not tried again."""
+    plans = {"hut": SimpleNamespace(blocks=[Block("r000c000")], left_out={}), "town": TOWN}
+    found = [Failure("hut", "r000c000", "sections", "y.log", "no roof"), lost()]
+    assert failures.publish_rest(found, plans, ["--cores", "2"], {}, tmp_path)
+    assert [command[-2:] for command in nested] == [["scene=town", "leave_out=town/r000c001/sections"]]
+    assert not (tmp_path / "hut").exists()
+    told = failures.told(found, True, plans, tmp_path)
+    assert "hut: all its blocks failed, so nothing of it is published" in told
+    assert "1 of 2 blocks failed; the rest of the city is published" in told
+
+
+def test_what_is_published_tells_why_blocks_failed_this_time(tmp_path):
+    for name, reason in (("failed", "new"), ("run", "old")):
+        record = {"r000c001": {"status": "failed", "reason": reason}}
+        store.write_json(tmp_path / f"{name}.json", record if name == "failed" else {"failed_blocks": record})
+    assert not failures._published(tmp_path)
+    store.write_json(tmp_path / "run.json", {"failed_blocks": store.read_json(tmp_path / "failed.json")})
+    assert failures._published(tmp_path)
+
+
+def test_a_record_of_failures_goes_once_the_city_is_whole(tmp_path):
+    store.write_json(tmp_path / failures.RECORD, {"r000c001": {}})
+    failures.settle(tmp_path)  # nothing is published yet
+    store.write_json(tmp_path / "run.json", {"failed_blocks": {"r000c001": {}}})
+    failures.settle(tmp_path)
+    assert store.read_json(tmp_path / failures.RECORD)
+    store.write_json(tmp_path / "run.json", {"failed_blocks": {}})
+    failures.settle(tmp_path)
+    assert not (tmp_path / failures.RECORD).exists()
+    assert not verify.findings(tmp_path)[0]
+
+
 @pytest.mark.parametrize(
     ("log", "reason"),
     [
@@ -126,3 +159,25 @@ def test_verify_leaves_a_users_files_alone(tmp_path):
     assert not (folder / "city.gpkg").exists()
     assert [p.name for p in (folder / "blocks/r0").iterdir() if p.is_file()] == ["planes.parquet"]
     assert Path(folder, "city.gpkg.changed") not in {f.path for f in verify.findings(folder)[0]}
+
+
+def test_verify_keeps_every_edit_and_asks_for_tiles_anew(tmp_path, monkeypatch):
+    """A second edit does not replace the first; one damaged tile takes the list with it, for which alone a rule is asked."""
+    folder = tmp_path / "town"
+    for text in ("hours of work", "a touch"):
+        store.write_json(folder / "city.gpkg", 1)
+        (folder / "city.gpkg").write_text(text)
+        verify.mend(verify.findings(folder)[0], folder)
+    assert [(folder / f"city.gpkg{end}").read_text() for end in (".changed", ".2.changed")] == [
+        "hours of work",
+        "a touch",
+    ]
+    for name in ("tileset.json", "0_0.glb"):
+        store.write_json(folder / "tiles3d" / name, 1)
+    (folder / "tiles3d/0_0.glb").write_bytes(b"damaged")
+    (folder / ".tmp-tiles3d").mkdir()
+    (folder / ".tmp-tiles3d/.tmp-x-0_0.glb").write_bytes(b"left by a kill")
+    with pytest.raises(verify.Damaged, match="1 of 2"):
+        verify.main([str(folder)])
+    assert sorted(p.name for p in (folder / "tiles3d").iterdir() if p.is_file()) == ["0_0.glb.changed"]
+    assert not (folder / ".tmp-tiles3d").exists()

@@ -236,3 +236,10 @@ def test_the_command_line_stands_above_a_scenes_own_keys(tmp_path):
         found = recipe.recipe(config, tmp_path, told)
         assert found.own["town"]["view_elevation"] == elevation
         assert f"--view-elevation={elevation}" in found.training["both"]
+    elsewhere = {**config, "scene": "other"}  # what is told of that is not meant for this one
+    assert recipe.recipe(elsewhere, tmp_path, ("view_elevation",)).own["town"]["view_elevation"] == 59.3
+
+
+def test_regions_for_all_scenes_are_refused_too(tmp_path):
+    with pytest.raises(BadConfig, match="has regions"):
+        recipe.recipe({"regions": "r.gpkg", "scenes": {"town": TOWN}, "train": {"own": ["town"]}}, tmp_path)

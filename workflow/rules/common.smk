@@ -249,11 +249,12 @@ def todo(p):
     """How many blocks of a scene each step is still to make, by step."""
     fed = p.settings["feed"] == "truth"
     skipped = ("tiles", "sections", "corners") if fed else ("feed",)
-    skipped += ("corners",) if p.measured else ()
+    single = p.settings["method"] == "single"
+    skipped += ("corners",) if p.measured or single else ()
     signed = {step: step for step in BLOCK_FILES}
     signed |= {"ground": "planes", "solids": "solids_of_block"}
-    if p.settings["method"] == "single":
-        signed |= {"sections": "single", "corners": "single"}
+    if single:
+        signed["sections"] = "single"
     return {
         step: sum(
             not made(
@@ -270,6 +271,12 @@ def failed(wildcards):
     """`--blocks FILE` where the city is made without some blocks: which, and why."""
     path = RESULTS / wildcards.scene / failures.RECORD
     return ["--blocks", str(path)] if plan(wildcards).left_out and path.exists() else []
+
+
+def why_failed(wildcards):
+    """What that file says: for other reasons the city is published anew."""
+    path = RESULTS / wildcards.scene / failures.RECORD
+    return path.read_text() if failed(wildcards) else ""
 
 
 def report_failures(jobs, stopped):

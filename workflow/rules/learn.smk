@@ -3,13 +3,10 @@
 
 from kibs_steps.learn import recipe as recipes
 
-try:
-    RECIPE = recipes.recipe(
-        config, Path(workflow.basedir), told=workflow.config_settings.config
-    )
-    TRAIN = {**recipes.DEFAULTS, **(config.get("train") or {})}
-except KibsError as error:
-    raise WorkflowError(str(error)) from None
+RECIPE = cli.or_exit(
+    recipes.recipe, config, Path(workflow.basedir), workflow.config_settings.config
+)
+TRAIN = {**recipes.DEFAULTS, **(config.get("train") or {})}
 
 
 wildcard_constraints:

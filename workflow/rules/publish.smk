@@ -24,6 +24,7 @@ rule geopackage:
         signature=signature("solids"),
         tiling=lambda w: plan(w).tiling,
         blocks=failed,
+        reasons=why_failed,
     shell:
         "python -m kibs_steps.publish.geopackage --scene {input.scene:q} --tile {params.tiling.tile}"
         " --margin {params.tiling.margin} --block {params.tiling.block} --sections {input.sections:q}"
@@ -313,7 +314,11 @@ rule record:
     input:
         scene=given("results/{scene}/scene.json"),
         sources=given(
-            lambda w: [*sources.files(plan(w).raster), *plan(w).terrain_files]
+            lambda w: [
+                *sources.files(plan(w).raster),
+                *plan(w).terrain_files,
+                *plan(w).named_files,
+            ]
         ),
         models=given(licensed),
         sections=given("results/{scene}/buildings.parquet"),
@@ -329,6 +334,7 @@ rule record:
         settings=lambda w: json.dumps(plan(w).settings),
         remote=lambda w: plan(w).remote,
         blocks=failed,
+        reasons=why_failed,
     shell:
         "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} {params.remote:q} --models {input.models:q}"
         " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"

@@ -26,6 +26,7 @@ from kibs_steps import scene as scenes
 from kibs_steps.mesh import Mesh, meshes
 from kibs_steps.publish import licences
 from kibs_steps.publish.glb import origin_of
+from kibs_steps.publish.preview import by_height
 from kibs_steps.scene import Scene
 
 LONGEST = 1400  # px: longer side of the image on the ground
@@ -53,6 +54,7 @@ class Packed:
         return {"type": self.kind, "gzip": base64.b64encode(self.content.getvalue()).decode()}
 
 
+BLOCK = "one block"  # of a building that stands as one, without sections
 KINDS_OF = {"positions": "i4", "surface": "u4", "building": "u4", "kind": "u1", "slope": "f4", "azimuth": "u2", "status": "u1",
             "section": "u4"}  # fmt: skip
 
@@ -71,7 +73,11 @@ def arrays(found: Iterable[Mesh], origin: np.ndarray) -> tuple[dict[str, Any], d
     for number, mesh in enumerate(found):
         for name in SHOWN:
             rows[name].append(mesh.building if name == "building_id" else mesh.attributes.get(name))
-        names += sorted({m["status"] for m in mesh.surfaces if "status" in m} - set(names))
+        # A roof without sections has no status of one.
+        of_surfaces = [
+            m.get("status", BLOCK if kind == 0 else "ok") for m, kind in zip(mesh.surfaces, mesh.kind, strict=True)
+        ]
+        names += sorted(set(of_surfaces) - set(names))
         of_building = {
             "positions": np.rint((mesh.triangles - origin) * 100),
             "surface": mesh.face + surfaces,
@@ -79,7 +85,7 @@ def arrays(found: Iterable[Mesh], origin: np.ndarray) -> tuple[dict[str, Any], d
             "kind": mesh.kind,
             "slope": np.array([m.get("slope", 0.0) for m in mesh.surfaces]),
             "azimuth": np.array([round(m["azimuth"]) % 360 if "azimuth" in m else NO_AZIMUTH for m in mesh.surfaces]),
-            "status": np.array([names.index(m.get("status", "ok")) for m in mesh.surfaces]),
+            "status": np.array([names.index(status) for status in of_surfaces]),
             "section": np.array([m.get("section_id", 0) for m in mesh.surfaces]),
         }
         for name, values in of_building.items():
@@ -117,7 +123,7 @@ def write(out: TextIO, scene: Scene, found: Iterable[Mesh], licence: str) -> Non
         "title": scene.name,
         "note": f"{len(buildings['building_id']):,} buildings {where}. {licence}".strip(),
         "origin": origin.tolist(),
-        "highest": picture.nice_length(max(float(np.quantile(known, 0.98)), 1.0)) if known else 10.0,
+        "highest": by_height(np.array(known, float))[1],
         "statuses": statuses,
         "buildings": buildings,
         "terrain": terrain,

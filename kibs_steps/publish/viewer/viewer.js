@@ -7,7 +7,7 @@ const TYPES = { f4: Float32Array, i4: Int32Array, u4: Uint32Array, u2: Uint16Arr
 const HEIGHTS = ["#34265e", "#365c8d", "#277f8e", "#2ea67f", "#84cc5e", "#f0e55c"];
 const KINDS = [["roof", "#b05442"], ["wall", "#e5dece"], ["ground", "#8c8a82"]];
 const WALL = [0.9, 0.87, 0.81];
-const STATUS = ["#2ea67f", "#f0b43c", "#e8752c", "#c23b4b", "#8a5a9e", "#365c8d", "#7a8086", "#26292e", "#5bb8d0", "#d08fb0"];
+const STATUS = ["#2ea67f", "#f0b43c", "#e8752c", "#c23b4b", "#8a5a9e", "#365c8d", "#7a8086", "#26292e", "#5bb8d0", "#d08fb0", "#b9b4a8"];
 const LODS = { "1.3": "#f0b43c", "1.2": "#e8752c", 0: "#c23b4b" };
 
 async function unpacked(packed) {
@@ -175,7 +175,7 @@ function hsv(hue, strength, light) {
     facts.replaceChildren(heading("building"), table(values), heading(KINDS[kind[s]][0]));
     if (kind[s] === 0) {
       const turned = azimuth[s] === 65535 ? null : azimuth[s] + "°";
-      facts.append(table({ section_id: section[s] || null, status: data.statuses[status[s]], slope: slope[s].toFixed(1) + "°", azimuth: turned }));
+      facts.append(table({ section_id: section[s] || null, status: section[s] ? data.statuses[status[s]] : null, slope: slope[s].toFixed(1) + "°", azimuth: turned }));
     }
     const lines = [];
     for (let t = 0; t < ofTriangle.length; t++) {
