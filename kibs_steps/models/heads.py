@@ -176,6 +176,8 @@ def absorb_small(labels: np.ndarray, min_area: int) -> np.ndarray:
     small = [int(i) for i in np.flatnonzero((area > 0) & (area < min_area)) if i > 0]
     boxes = ndimage.find_objects(labels) if small else []
     for label in sorted(small, key=lambda i: (area[i], i)):
+        if area[label] >= min_area:
+            continue  # by what it was given itself
         place = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in boxes[label - 1])
         part = labels[place]
         own = part == label
@@ -185,6 +187,7 @@ def absorb_small(labels: np.ndarray, min_area: int) -> np.ndarray:
         taker = int(np.bincount(around).argmax()) if around.size else 0
         part[own] = taker
         if taker:  # which may be a small one itself
+            area[taker] += area[label]
             both = zip(boxes[label - 1], boxes[taker - 1], strict=True)
             boxes[taker - 1] = tuple(slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in both)
     return relabelled(labels)

@@ -170,3 +170,11 @@ def test_a_full_mask_fills_its_box_to_the_rim():
         window, mask = heads.pasted(np.float32(box), np.ones((28, 28), np.float32), 64)
         assert (window[1].start, window[0].start, window[1].stop, window[0].stop) == tuple(box)
         assert (mask > 0.5).all(), box
+
+
+def test_small_sections_that_touch_are_one_that_is_large_enough():
+    labels = np.zeros((8, 12), np.int32)
+    labels[2:5, 1:5], labels[2:5, 5:9] = 1, 2  # 12 px each
+    for order in (labels, np.where(labels > 0, 3 - labels, 0)):
+        assert (heads.absorb_small(order, 16) == (labels > 0)).all()
+    assert not heads.absorb_small(labels, 25).any()
