@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 from kibs_steps import store
 from kibs_steps.errors import KibsError
 
-GEOREFERENCES = (".tfw", ".tifw", ".jgw", ".jp2w", ".j2w", ".pgw", ".bpw", ".wld", ".prj", ".hdr")
+GEOREFERENCES = (".tfw", ".tifw", ".jgw", ".jp2w", ".j2w", ".pgw", ".jpgw", ".pngw", ".bpw", ".wld", ".prj", ".hdr")
 RASTERS = (
     ".tif",
     ".tiff",
@@ -63,7 +63,8 @@ def of_source(path: str | Path, cache: str | Path) -> str | list[str]:
     """
     path = Path(path)
     own = [path] if path.is_file() else []
-    every = [of_file(file, cache) for file in [*own, *companions(path)]]
+    files = [*own, *companions(path)]
+    every = [of_file(file, cache) for file in files] + [told for file in files for told in _said_beside(file)]
     return every[0] if own and len(every) == 1 else every
 
 
@@ -86,8 +87,23 @@ def _beside(file: Path) -> list[Path]:
     """The files that may stand beside a raster or a GeoPackage and tell more of it."""
     edits = file.with_name(f"{file.name}-wal")
     masks = file.with_name(f"{file.name}.msk")
-    about = [file.with_suffix(ending) for ending in GEOREFERENCES] if file.suffix.lower() in RASTERS else []
+    endings = [e for ending in GEOREFERENCES for e in (ending, ending.upper())]
+    about = [file.with_suffix(ending) for ending in endings] if file.suffix.lower() in RASTERS else []
     return [masks, *about, *([edits] if edits.is_file() and edits.stat().st_size else [])]
+
+
+def _said_beside(file: Path) -> list[str]:
+    """A hash of what GDAL keeps of a raster in NAME.aux.xml (nodata, CRS, place), if it does; not of the statistics that viewers
+    write there."""
+    try:
+        root = ElementTree.parse(file.with_name(f"{file.name}.aux.xml")).getroot()
+    except (ElementTree.ParseError, OSError):
+        return []
+    for element in list(root.iter()):
+        for part in [part for part in element if part.tag in ("Metadata", "Histograms")]:
+            element.remove(part)
+    said = [(e.tag, e.text.strip(), sorted(e.attrib.items())) for e in root.iter() if e.text and e.text.strip()]
+    return [of_values(said)] if said else []
 
 
 def _named_in(vrt: Path) -> list[Path]:

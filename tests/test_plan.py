@@ -262,6 +262,14 @@ def test_what_stands_beside_a_file_counts_as_its_content(tmp_path):
         before = fingerprint.of_source(file, cache)
         more.write_bytes(b"other")
         assert len({str(alone), str(before), str(fingerprint.of_source(file, cache))}) == 3, name
+    band = "<PAMRasterBand band='1'>{}<Metadata><MDI key='STATISTICS_MEAN'>{}</MDI></Metadata></PAMRasterBand>"
+    aux = f"<PAMDataset>{band}</PAMDataset>"
+    found = []
+    for said in (("", 1), ("", 2), ("<NoDataValue>0</NoDataValue>", 2), ("<NoDataValue>1</NoDataValue>", 3)):
+        (tmp_path / "p.tif.aux.xml").write_text(aux.format(*said))
+        found.append(str(fingerprint.of_source(tmp_path / "p.tif", cache)))
+    assert found[0] == found[1]  # a viewer's statistics
+    assert len(set(found)) == 3
     (tmp_path / "t.gpkg-wal").write_bytes(b"")
     assert fingerprint.of_source(tmp_path / "t.gpkg", cache) == fingerprint.of_file(tmp_path / "t.gpkg", cache)
 
