@@ -137,10 +137,7 @@ def scenes(config: dict[str, Any], schema: dict[str, Any], told: Collection[str]
             "no scene to build: add one under `scenes:` in config.yaml, or give --config scene=NAME raster=FILE"
         )
     last = {k: v for k, v in common.items() if k in told}
-    return {
-        name: {**DEFAULTS, **with_angles(common), **with_angles(listed.get(name) or {}), **with_angles(last)}
-        for name in wanted
-    }
+    return {name: {**DEFAULTS, **layered(common, listed.get(name) or {}, last)} for name in wanted}
 
 
 def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan:
@@ -150,7 +147,6 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
-    settings = with_angles(settings)
     if settings["mode"] == "paper":
         settings = {**settings, **PAPER_MODE}
     models = models_for(settings, base)
@@ -226,9 +222,14 @@ def angles_of(settings: dict[str, Any]) -> dict[str, float]:
     return {key: value for key, value in metadata.read(settings["metadata"])._asdict().items() if value is not None}
 
 
-def with_angles(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of one place, with the angles that their `metadata` tells and they do not say themselves."""
-    return {**angles_of(settings), **settings}
+def layered(*layers: dict[str, Any]) -> dict[str, Any]:
+    """Settings of several places, later ones above those before. The last `metadata` among them is the one that is meant: its
+    angles stand where it stands, below what is set beside it."""
+    telling = max((i for i, layer in enumerate(layers) if "metadata" in layer), default=None)
+    found: dict[str, Any] = {}
+    for i, layer in enumerate(layers):
+        found |= {**angles_of(layer), **layer} if i == telling else layer
+    return found
 
 
 def direction(settings: dict[str, Any], name: str) -> dict[str, float] | None:

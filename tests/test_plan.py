@@ -308,6 +308,9 @@ def test_metadata_stands_where_it_is_given(files):
         ({"view_azimuth": 10.0, "scenes": {"s": own}}, (), 280.0),
     ):
         assert plan.scenes(config, SCHEMA, told)["s"]["view_azimuth"] == azimuth
+    (folder / "lit.IMD").write_text("meanSatAz = 20;\nmeanSatEl = 70;\nmeanSunAz = 150;\nmeanSunEl = 45;\n")
+    found = plan.scenes({"metadata": str(folder / "lit.IMD"), "scenes": {"s": own}}, SCHEMA)["s"]
+    assert (found["view_azimuth"], found.get("sun_azimuth")) == (280.0, None)  # nothing of another image's file
 
 
 def test_a_simulated_city_reruns_with_its_file(files):

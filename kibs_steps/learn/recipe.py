@@ -12,7 +12,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kibs_steps.plan import BadConfig, folder_of, with_angles
+from kibs_steps.plan import BadConfig, folder_of, layered
 
 DEFAULTS = {
     "name": "mine",
@@ -87,19 +87,19 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
     common = {k: v for k, v in config.items() if k in (*OWN, "metadata", "regions")}
     scenes = {str(name): own for name, own in (config.get("scenes") or {}).items()}
 
-    def settings_of(name: str, wanted_by: str) -> dict[str, Any]:
+    def layers_of(name: str, wanted_by: str) -> list[dict[str, Any]]:
         if name not in scenes and name != str(config.get("scene")):
             raise BadConfig(f"train.{wanted_by}: there is no scene {name!r} in the configuration")
         # What the command line says of one scene is not meant for another.
         meant = config.get("scene") in (None, "") or name == str(config["scene"])
         last = {k: v for k, v in common.items() if meant and k in told}
-        return {**with_angles(common), **with_angles(scenes.get(name) or {}), **with_angles(last)}
+        return [common, scenes.get(name) or {}, last]
 
     own: dict[str, dict[str, Any]] = {}
     for i, item in enumerate(train["own"]):
         item = {"scene": item} if isinstance(item, str) else item
-        before = settings_of(item["scene"], "own") if "scene" in item else with_angles(common)
-        given = {**before, **with_angles(item)}
+        before = layers_of(item["scene"], "own") if "scene" in item else [common]
+        given = layered(*before, item)
         name = str(item.get("name", item.get("scene", f"own{i}")))
         if "truth" not in item and ("buildings" in item or "guess" in item):
             given.pop("truth", None)
@@ -139,7 +139,7 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
         options.append("--shares=" + ",".join(f"{k}={v}" for k, v in train["shares"].items()))
     look, untold = {}, []
     if train["scene"]:
-        scene = settings_of(train["scene"], "scene")
+        scene = layered(*layers_of(train["scene"], "scene"))
         if scene.get("regions"):
             raise BadConfig(
                 f"train.scene: {train['scene']} has regions: name a scene of one view, with its own aoi and angles"
