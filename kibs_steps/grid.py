@@ -94,6 +94,18 @@ class Block(NamedTuple):
     col: int
 
 
+def block_name(row: int, col: int) -> str:
+    """The name of a block by its place."""
+    return f"r{row:03d}c{col:03d}"
+
+
+def neighbours(name: str) -> list[str]:
+    """The names of the up to eight blocks about one; some may lie beyond the grid's far sides."""
+    row, col = map(int, name[1:].split("c"))
+    places = [(r, c) for r in range(row - 1, row + 2) for c in range(col - 1, col + 2)]
+    return [block_name(r, c) for r, c in places if (r, c) != (row, col) and r >= 0 and c >= 0]
+
+
 class Tiling(NamedTuple):
     """How a grid is cut: tile side s and margin p (px), block side in tiles."""
 
@@ -114,9 +126,7 @@ class Tiling(NamedTuple):
         """All blocks, row by row."""
         rows, cols = self.shape(width, height)
         return [
-            Block(f"r{i:03d}c{j:03d}", i, j)
-            for i in range(-(-rows // self.block))
-            for j in range(-(-cols // self.block))
+            Block(block_name(i, j), i, j) for i in range(-(-rows // self.block)) for j in range(-(-cols // self.block))
         ]
 
     def block_of(self, name: str) -> Block:

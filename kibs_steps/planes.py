@@ -24,6 +24,7 @@ import pyarrow as pa
 import shapely
 
 from kibs_steps import cli, heightmap, scene, store, view
+from kibs_steps.grid import neighbours
 from kibs_steps.view import Plane
 
 SHARED = 2.0  # px: a corner on a ridge or eave belongs to every section whose rim is as near, up to this
@@ -424,13 +425,6 @@ def main(argv: list[str] | None = None) -> None:
     table, filed = planes(sections, corners, facts, dtm, fallback, args.reach, args.rule, others)
     store.write_table(args.planes, table)
     store.write_table(args.filed, filed)
-
-
-def neighbours(name: str) -> list[str]:
-    """The names of the eight blocks about one."""
-    row, col = map(int, name[1:].split("c"))
-    steps = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
-    return [f"r{row + r:03d}c{col + c:03d}" for r, c in steps if row + r >= 0 and col + c >= 0]
 
 
 def middle_of(outlines: np.ndarray, facts: scene.Scene) -> np.ndarray:

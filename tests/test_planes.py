@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kibs_steps import planes, view
+from kibs_steps.grid import neighbours
 from kibs_steps.planes import Points
 
 
@@ -231,4 +232,4 @@ def test_a_corner_on_a_neighbours_rim_is_the_neighbours_even_where_that_is_not_a
     assert together[0].tolist() == [1, 1]
     alone = planes.file_corners(np.array([mine]), corners, free, np.zeros(1, int), 6.0, 2.0, [other])
     assert len(alone[0]) == 0
-    assert planes.neighbours("r000c001") == ["r000c000", "r000c002", "r001c000", "r001c001", "r001c002"]
+    assert neighbours("r000c001") == ["r000c000", "r000c002", "r001c000", "r001c001", "r001c002"]
