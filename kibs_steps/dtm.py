@@ -258,6 +258,7 @@ def _canvas(source: rasterio.DatasetReader, grid: Grid, moves: np.ndarray = STAY
         src_nodata=nodata,
         nodata=np.nan,
         dtype="float64" if source.dtypes[0] == "float64" else "float32",
+        **imagery.unwrapped(source),
     ) as warped:
         yield Canvas(
             transform, width, height, lambda first, last: heights(warped, Window(0, first, width, last - first))

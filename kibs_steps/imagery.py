@@ -12,7 +12,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -125,6 +125,26 @@ def crs_of(source: rasterio.DatasetReader) -> pyproj.CRS:
     if not (crs.is_projected or crs.is_geographic):
         raise NotGeoreferenced(f"{source.name} has a local CRS ({crs.name}): assign its real one (gdal_edit.py -a_srs)")
     return crs
+
+
+def unwrapped(source: rasterio.DatasetReader) -> dict[str, Any]:
+    """How a `WarpedVRT` is to place a raster in degrees that goes beyond ±180° (0 to 360°, or across the 180th meridian): counted
+    from the meridian in its middle, as GDAL would look for its pixels 360° away. Nothing for others."""
+    import pyproj
+    from affine import Affine
+
+    t = source.transform
+    if not crs_of(source).is_geographic or (source.bounds.left >= -180.0 and source.bounds.right <= 180.0):
+        return {}
+    middle = round((source.bounds.left + source.bounds.right) / 2)
+    wkt = pyproj.CRS.from_wkt(source.crs.to_wkt()).to_wkt("WKT1_GDAL")
+    numberless = re.sub(r',AUTHORITY\["[^"]*","[^"]*"\]', "", wkt)
+    moved = re.sub(r'PRIMEM\["[^"]*",0\]', f'PRIMEM["{middle} degrees east",{middle}]', numberless)
+    if moved == numberless:
+        raise NotGeoreferenced(
+            f"{source.name} has longitudes beyond 180°, counted from another meridian than Greenwich: warp it to EPSG:4326 first"
+        )
+    return {"src_crs": moved, "src_transform": Affine(t.a, t.b, t.c - middle, t.d, t.e, t.f)}
 
 
 def crs_name(crs: pyproj.CRS) -> str:

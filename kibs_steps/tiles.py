@@ -112,6 +112,7 @@ def on_grid(source: rasterio.DatasetReader, grid: Grid, nodata: float | None) ->
         SRC_ALPHA_MAX="1",  # any alpha above 0 is data, whatever the type's greatest value
         XSCALE=scale_x,
         YSCALE=scale_y,
+        **imagery.unwrapped(source),
     )
 
 

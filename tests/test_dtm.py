@@ -68,6 +68,20 @@ class TestDtm:
         self.check(made, 0.02)
         assert content["dtm"]["step"][0] == pytest.approx(3.0, rel=0.05)
 
+    def test_longitudes_from_0_to_360_degrees(self, tmp_path):
+        heights = np.random.default_rng(2).normal(100, 5, (1, 60, 60)).astype("float32")
+        image = rasters.write(
+            tmp_path / "a.tif", rasters.picture(), "EPSG:32719", transform=Affine(0.38, 0, 4e5, 0, -0.38, 6.3e6)
+        )
+        west, north = pyproj.Transformer.from_crs(32719, 4326, always_xy=True).transform(4e5, 6.3e6)
+        made = {}
+        for name, left in (("usual", west - 0.02), ("beyond", west - 0.02 + 360)):
+            ground = rasters.dtm(tmp_path / f"{name}.tif", heights[0], left, north + 0.02, 7e-4, "EPSG:4326")
+            scene, content = build(tmp_path / name, image, str(ground))
+            made[name] = scene.terrain(scene.grid.bounds)(scene.grid.to_map([[0, 0], [50, 40], [110, 90]]))
+            assert content["dtm"]["filled"] == 0
+        assert made["beyond"] == pytest.approx(made["usual"], abs=1e-3)
+
     @pytest.mark.parametrize("unit", ["ft", "US survey foot", "foot"])
     def test_feet_by_band_unit(self, tmp_path, unit):
         path = rasters.dtm(tmp_path / "dtm.tif", self.heights() / np.float32(0.3048), self.LEFT, self.TOP)

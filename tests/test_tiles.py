@@ -210,10 +210,12 @@ CASES = [
     ("EPSG:32631", Affine(0.3, 0, 500_000, 0, 0.3, 5_400_000)),
     ("EPSG:32631", Affine(0.3, 0.1, 500_000, 0.1, -0.3, 5_400_000)),
     ("EPSG:4326", Affine(5e-6, 0, 4.5, 0, -3.4e-6, 51.9)),
+    ("EPSG:4326", Affine(5e-6, 0, 289.3, 0, -3.6e-6, -33.4)),
+    ("EPSG:4326", Affine(5e-6, 0, 179.9996, 0, -4.5e-6, -17.0)),
     ("EPSG:3857", Affine(0.5, 0, 500_000, 0, -0.5, 6_780_000)),
     ("EPSG:2263", Affine(1.2, 0, 980_000, 0, -1.2, 200_000)),
 ]
-IDS = ["0.3 m", "0.12 m", "0.5 m", "south up", "rotated", "degrees", "web mercator", "feet"]
+IDS = ["0.3 m", "0.12 m", "0.5 m", "south up", "rotated", "degrees", "0 to 360", "180", "web mercator", "feet"]
 
 
 class TestResampled:
@@ -235,6 +237,8 @@ class TestResampled:
         rows, cols = np.nonzero(valid)
         x, y = made.grid.to_map(np.column_stack([cols + 0.5, rows + 0.5])).T
         x, y = pyproj.Transformer.from_crs(made.grid.crs, crs, always_xy=True).transform(x, y)
+        if crs == "EPSG:4326":
+            x += 360 * np.rint((transform.c - x) / 360)
         c, r = ~transform * (x, y)
         inner = (c > 4) & (c < width - 4) & (r > 4) & (r < height - 4)
         assert valid.sum() * made.grid.gsd**2 > 0.9 * self.ground_area(transform, crs, made, height, width)
