@@ -66,7 +66,7 @@ def _scene_crs(source: rasterio.DatasetReader) -> tuple[pyproj.CRS, bool]:
 
     crs, t = imagery.crs_of(source), source.transform
     north_up = t.b == 0 and t.d == 0 and t.a > 0 and t.e < 0
-    if north_up and _in_true_metres(crs, imagery.outline(source, crs, 1).mean(axis=0)):
+    if north_up and in_true_metres(crs, imagery.outline(source, crs, 1).mean(axis=0)):
         return crs, True
     longitude, latitude = imagery.outline(source, pyproj.CRS.from_epsg(DEGREES), 1).mean(axis=0)
     return _utm(longitude, latitude), False
@@ -97,8 +97,8 @@ def grid_of(source: rasterio.DatasetReader, gsd: float) -> Grid:
     return Grid(imagery.crs_name(crs), float(left), float(top), float(gsd), width, height)
 
 
-def _in_true_metres(crs: pyproj.CRS, centre: np.ndarray) -> bool:
-    """Whether a map metre of this CRS is a metre on the ground, within 1 %: not so in feet, degrees and Mercator."""
+def in_true_metres(crs: pyproj.CRS, centre: np.ndarray) -> bool:
+    """Whether at `centre` (x, y) a metre of this CRS is one on the ground, within 1 %: not in feet, degrees, Mercator."""
     if not crs.is_projected or any(axis.unit_conversion_factor != 1.0 for axis in crs.axis_info):
         return False
     if "Pseudo" in crs.coordinate_operation.method_name:

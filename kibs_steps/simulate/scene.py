@@ -14,7 +14,7 @@ import numpy as np
 from kibs_steps import cli, store
 from kibs_steps import view as geometry
 from kibs_steps.errors import KibsError
-from kibs_steps.georeference import convergence
+from kibs_steps.georeference import convergence, in_true_metres
 from kibs_steps.grid import Grid
 from kibs_steps.scene import Direction
 from kibs_steps.simulate import citymodel, real
@@ -279,6 +279,8 @@ class UnusableScene(KibsError):
 
 def main(argv: list[str] | None = None) -> None:
     """Simulate one scene and write its raster, terrain, truth and angles."""
+    import pyproj
+
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size", type=int, default=1200, help="pixels per side")
@@ -307,6 +309,8 @@ def main(argv: list[str] | None = None) -> None:
     model = citymodel.read(args.city) if args.city else None
     crs = model.crs if model and model.crs else args.crs
     grid = Grid(crs, *_origin(crs, args.gsd, args.size, model), args.gsd, args.size, args.size)
+    if not in_true_metres(pyproj.CRS(crs), np.array(grid.bounds).reshape(2, 2).mean(axis=0)):
+        raise UnusableScene(f"{crs}: there its metre is not one on the ground; give a UTM zone, such as EPSG:32631")
     turned = convergence(grid)
     view = _direction(args.view_azimuth, args.view_elevation, turned)
     sun = _direction(args.sun_azimuth, args.sun_elevation, turned)

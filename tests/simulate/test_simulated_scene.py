@@ -236,5 +236,7 @@ def test_program_writes_a_scene_twice_the_same(tmp_path):
 def test_unusable_requests_say_so(tmp_path):
     with pytest.raises(scene.UnusableScene, match="projected in metres"):
         scene.main(["--crs", "EPSG:4326", "--out", str(tmp_path)])
+    with pytest.raises(scene.UnusableScene, match="not one on the ground"):
+        scene.main(["--crs", "EPSG:3857", "--out", str(tmp_path)])
     with pytest.raises(scene.UnusableScene, match="elevation"):
         scene.main(["--view-elevation", "3", "--out", str(tmp_path)])
