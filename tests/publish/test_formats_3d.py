@@ -241,6 +241,27 @@ def test_viewer_is_one_file_that_asks_for_nothing(town, tmp_path):
     assert data["buildings"]["building_id"] == sorted(city.VOLUMES)
 
 
+@pytest.mark.parametrize("above", [None, 40.0], ids=["projected on the terrain", "40 m above"])
+def test_the_viewers_ground_lies_where_it_stands_under_what_the_image_shows(town, above):
+    folder, _ = town
+    made = scenes.read(folder / "scene.json")
+    base = float(made.terrain(made.grid.bounds)(np.array([made.grid.bounds[:2]]))[0])
+    made = made._replace(
+        view=Direction(180.0, 60.0, view.lean(180.0, 60.0)), projection_height=None if above is None else base + above
+    )
+    origin = glb.origin_of(made)
+    shape, points = viewer.terrain_of(made, origin)
+    points = points + origin
+    assert np.allclose(points[:, 2], made.terrain(made.grid.bounds)(points[:, :2]), atol=0.01)
+    ground = made.projected_on(made.terrain(made.grid.bounds))
+    seen = view.image_position(points[:, :2], points[:, 2], made.lean, ground)
+    left, bottom, right, top = made.grid.bounds
+    x, y = np.meshgrid(np.linspace(left, right, shape["cols"]), np.linspace(top, bottom, shape["rows"]))
+    assert np.allclose(seen, np.column_stack([x.ravel(), y.ravel()]), atol=0.02)
+    moved = np.hypot(*(points[:, :2] - seen).T)
+    assert moved.max() < 0.02 if above is None else moved.min() > 0.4 * above
+
+
 @pytest.mark.skipif(not shutil.which("chromium"), reason="chromium is not installed")
 def test_the_viewer_draws_in_a_browser(town, tmp_path):
     _, arguments = town

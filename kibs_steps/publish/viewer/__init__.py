@@ -28,6 +28,7 @@ from kibs_steps.publish import licences
 from kibs_steps.publish.glb import origin_of
 from kibs_steps.publish.preview import by_height
 from kibs_steps.scene import Scene
+from kibs_steps.view import ground_position
 
 LONGEST = 1400  # px: longer side of the image on the ground
 TERRAIN = 160  # points of terrain along the longer side
@@ -94,25 +95,29 @@ def arrays(found: Iterable[Mesh], origin: np.ndarray) -> tuple[dict[str, Any], d
     return {name: pack.text() for name, pack in packs.items()}, rows, names
 
 
-def terrain_of(scene: Scene, origin: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
-    """The grid of the terrain shown (extent in metres from `origin`) and its heights, row by row from the north."""
+def terrain_of(scene: Scene, origin: np.ndarray) -> tuple[dict[str, int], np.ndarray]:
+    """The terrain shown: its columns and rows, and its points (n, 3; m, places from `origin`), row by row from the north.
+
+    A point lies where the ground stands that the image shows at an even grid, so the image drapes over them evenly.
+    """
     left, bottom, right, top = scene.grid.bounds
     longest = max(right - left, top - bottom)
     cols, rows = (max(2, round(TERRAIN * side / longest)) for side in (right - left, top - bottom))
     x, y = np.meshgrid(np.linspace(left, right, cols), np.linspace(top, bottom, rows))
     finest = longest / TERRAIN / 4  # of a fine model only so many heights are read
-    heights = scene.terrain(scene.grid.bounds, step=finest)(np.column_stack([x.ravel(), y.ravel()]))
-    extent = {"x0": left - origin[0], "y0": bottom - origin[1], "x1": right - origin[0], "y1": top - origin[1]}
-    return {"cols": cols, "rows": rows, **{k: round(v, 3) for k, v in extent.items()}}, heights.astype(np.float32)
+    dtm = scene.terrain(scene.grid.bounds, step=finest)
+    seen = np.column_stack([x.ravel(), y.ravel()])
+    place, z = ground_position(seen, np.zeros(len(seen)), dtm, scene.leans(seen), scene.projected_on(dtm))
+    return {"cols": cols, "rows": rows}, np.column_stack([place - origin[:2], z]).astype(np.float32)
 
 
 def write(out: TextIO, scene: Scene, found: Iterable[Mesh], licence: str) -> None:
     """Write the whole HTML file."""
     origin = origin_of(scene)
     columns, buildings, statuses = arrays(found, origin)
-    terrain, heights = terrain_of(scene, origin)
+    terrain, ground = terrain_of(scene, origin)
     pack = Packed("f4")
-    pack.add(heights)
+    pack.add(ground)
     columns["terrain"] = pack.text()
     rgb, _ = picture.overview(scene, LONGEST)
     jpeg = io.BytesIO()

@@ -84,26 +84,25 @@ function hsv(hue, strength, light) {
   const city = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide }));
   scene.add(city);
 
-  const { cols, rows, x0, y0, x1, y1 } = data.terrain;
+  const { cols, rows } = data.terrain;
   const ground = new THREE.BufferGeometry();
-  const [at, uv, faces] = [[], [], []];
+  const [uv, faces] = [[], []];
   for (let r = 0; r < rows; r++) {
     for (let c = 0; c < cols; c++) {
-      const [u, v] = [c / (cols - 1), r / (rows - 1)];
-      at.push(x0 + (x1 - x0) * u, y1 + (y0 - y1) * v, terrain[r * cols + c] - 0.15);
-      uv.push(u, 1 - v);
+      uv.push(c / (cols - 1), 1 - r / (rows - 1));
       if (r && c) {
         const k = r * cols + c;
         faces.push(k - cols - 1, k - 1, k, k - cols - 1, k, k - cols);
       }
     }
   }
-  ground.setAttribute("position", new THREE.BufferAttribute(new Float32Array(at), 3));
+  ground.setAttribute("position", new THREE.BufferAttribute(terrain, 3));
   ground.setAttribute("uv", new THREE.BufferAttribute(new Float32Array(uv), 2));
   ground.setIndex(faces);
   ground.computeVertexNormals();
   const plain = new THREE.MeshLambertMaterial({ color: "#cfcdc2", side: THREE.DoubleSide });
   const land = new THREE.Mesh(ground, plain);
+  land.position.z = -0.15; // below the buildings' own ground
   scene.add(land);
 
   const outline = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: "#ff2bd6" }));
@@ -112,8 +111,9 @@ function hsv(hue, strength, light) {
   const controls = new THREE.MapControls(camera, renderer.domElement);
   controls.maxPolarAngle = 1.55;
   geometry.computeBoundingSphere();
-  const size = Math.hypot(x1 - x0, y1 - y0);
-  const middle = new THREE.Vector3((x0 + x1) / 2, (y0 + y1) / 2, terrain[Math.floor(rows / 2) * cols + Math.floor(cols / 2)]);
+  const corners = [0, terrain.length - 3].map((i) => new THREE.Vector3(...terrain.subarray(i, i + 3)));
+  const size = Math.hypot(corners[0].x - corners[1].x, corners[0].y - corners[1].y);
+  const middle = corners[0].lerp(corners[1], 0.5).setZ(terrain[3 * (Math.floor(rows / 2) * cols + Math.floor(cols / 2)) + 2]);
   controls.target.copy(middle);
   camera.position.set(middle.x - 0.15 * size, middle.y - 0.62 * size, middle.z + 0.5 * size);
   camera.near = size / 2000;
