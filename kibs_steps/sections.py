@@ -221,14 +221,15 @@ def pieces(views: list[View], clear: np.ndarray, tiling: Tiling, core: Window) -
     """
     rows = []
     p = tiling.margin
+    beside = grown(~clear)  # of the whole block: what is missing may begin at a tile's seam
     for view in views:
         inside = core_of(view.labels, view.tile, p)
         outlines = pixel_outlines(inside, view.tile.core)
         full = np.bincount(view.labels.ravel(), minlength=1)
         own = np.bincount(inside.ravel(), minlength=len(full))
         place = window_in_block(view.tile.core, core, p)
-        blank = ~clear[place.row : place.row + place.height, place.col : place.col + place.width]
-        near_blank = set(np.unique(inside[grown(blank)]).tolist()) if blank.any() else set()
+        blank = beside[place.row : place.row + place.height, place.col : place.col + place.width]
+        near_blank = set(np.unique(inside[blank]).tolist())
         for label in np.unique(view.labels[view.labels > 0]).tolist():
             outline, number = outlines.get(label), label - view.used - 1
             rows.append(

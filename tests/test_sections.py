@@ -36,6 +36,14 @@ def test_sections_of_a_burnt_out_tile_are_void(share, white, flagged):
     assert all(shapely.from_wkb(wkb).area == 100 for wkb in table["outline"].to_pylist())
 
 
+def test_a_section_beside_missing_data_that_begins_at_the_tiles_seam_is_void():
+    _, valid, views, core = block(0.0)
+    views[0].labels[20:30, SIDE - MARGIN - 10 : SIDE - MARGIN] = 1  # reaches the seam to the tile at its right
+    valid[MARGIN : MARGIN + 48, MARGIN + 48 :] = False  # which has no data
+    table = sections.pieces(views, valid, TILING, core)
+    assert table["void"].to_pylist() == [True, True, False, False]
+
+
 @pytest.mark.parametrize("size", [(96, 96), (100, 51), (50, 49), (7, 143)])
 def test_networks_see_a_mirror_image_beyond_the_raster(size):
     """Whatever the cut into blocks; numpy's symmetric padding of a tile's own part is the truth."""
