@@ -118,6 +118,11 @@ def faithful(sections: Sections, solid: Solid) -> float | None:
     return float((near[counted] >= area[counted] / 2).mean())
 
 
+def _volume(solid: Solid) -> float:
+    """m³ of all shells."""
+    return round(float(sum(gate.volume([s.rings for s in shell]) for shell in solid.shells)) / MM**3, 3)
+
+
 def attributes(building: int, sections: Sections, solid: Solid) -> dict[str, Any]:
     """One row of `ATTRIBUTES`, geometries as shapely objects; of a footprint in several parts the largest."""
     area = np.array([0.0 if p is None else p.area for p in sections.polygons])
@@ -142,7 +147,7 @@ def attributes(building: int, sections: Sections, solid: Solid) -> dict[str, Any
         "eave_z": eave,
         "ridge_z": ridge,
         "height": None if ridge is None else round(ridge - ground, 3),
-        "volume": round(float(sum(gate.volume([s.rings for s in shell]) for shell in solid.shells)) / MM**3, 3),
+        "volume": _volume(solid) if solid.shells else None,
         "footprint_area": round(float(shapely.area(solid.base)), 3),
         "roof_type": solid.roof_type,
         "height_sigma": mean(sections.sigma),

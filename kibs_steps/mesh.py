@@ -20,7 +20,11 @@ import shapely
 from kibs_steps import store
 
 KINDS = ("RoofSurface", "WallSurface", "GroundSurface")
-COLOURS = np.array([[176, 84, 66], [229, 222, 208], [140, 138, 130]], np.uint8)  # by kind
+COLOURS = np.array([[176, 84, 66], [229, 222, 208], [140, 138, 130]], np.uint8)  # by kind, sRGB
+# The same as shares of light: what glTF takes for the colours of vertices.
+LINEAR = np.rint(255 * np.where(COLOURS <= 10, COLOURS / 255 / 12.92, ((COLOURS / 255 + 0.055) / 1.055) ** 2.4)).astype(
+    np.uint8
+)
 NUMBERS = pa.list_(pa.int32())
 MESHES = pa.schema(
     [

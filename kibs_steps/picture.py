@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 
 from kibs_steps import imagery, store, tiles
 from kibs_steps.scene import Scene
@@ -195,7 +196,10 @@ def colour_bar(
     draw.text((x + width + 8, y), ends[1], font=font(15), fill=INK, anchor="lm")
 
 
-def write(path: str | Path, picture: Image.Image) -> None:
-    """Write a PNG, whole."""
+def write(path: str | Path, picture: Image.Image, licence: str = "") -> None:
+    """Write a PNG, whole; it says under which licence."""
+    told = PngInfo()
+    if licence:
+        told.add_itxt("Copyright", licence)
     with store.whole(path) as temporary:
-        picture.save(temporary, format="PNG", optimize=False, compress_level=6)
+        picture.save(temporary, format="PNG", optimize=False, compress_level=6, pnginfo=told)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import shapely
 
 
+STOPS = 65  # points a side of the image at which it is asked where its ground stands
 SETTLED = 8  # steps after which a place at the border of two regions is left to one of them
 
 
@@ -113,6 +114,21 @@ class Scene(NamedTuple):
         """The DTM around `bounds` (left, bottom, right, top, map metres) and where what is seen there stands, no finer than a
         `step` (m) asks for."""
         return terrain.read(self.folder / "dtm.tif", bounds, margin + self.displaced, step)
+
+    @property
+    def standing(self) -> Grid:
+        """The grid laid over where the ground stands that the image shows: another one where it was projected on one height."""
+        if self.projection_height is None:
+            return self.grid
+        left, bottom, right, top = self.grid.bounds
+        x, y = np.meshgrid(np.linspace(left, right, STOPS), np.linspace(top, bottom, STOPS))
+        seen = np.column_stack([x.ravel(), y.ravel()])
+        dtm = self.terrain(self.grid.bounds, step=max(right - left, top - bottom) / STOPS / 4)
+        place, _ = geometry.ground_position(seen, np.zeros(len(seen)), dtm, self.leans(seen), self.projected_on(dtm))
+        pixels = self.grid.to_image(place)
+        col, row = np.floor(pixels.min(axis=0)).astype(int).tolist()
+        width, height = (np.ceil(pixels.max(axis=0)).astype(int) - (col, row)).tolist()
+        return self.grid.part(Window(col, row, width, height))
 
     def projected_on(self, dtm: Surface) -> Surface:
         """The surface the image was projected on: the DTM, or the constant `projection_height`."""

@@ -101,9 +101,17 @@ class Solid(NamedTuple):
     reason: str
     shells: list[list[Surface]]
     ground: int
-    roof_type: str
+    roof_type: str | None
     base: shapely.Geometry
     party: frozenset[tuple[Point, Point]] = frozenset()
+
+
+class Roof(NamedTuple):
+    """Faces and planes of a roof, and the height (mm) of the ground that its walls come down to."""
+
+    faces: list[Face]
+    planes: np.ndarray
+    ground: int
 
 
 class Built(NamedTuple):
@@ -225,18 +233,18 @@ def _climb(faces: list[Face], sections: Sections, dtm: Terrain, lod_label: str) 
     planes, refused = sections.planes, []
     ground = lowest_ground(shapes_of(faces), sections.origin, dtm)
     kind = roof_type(faces, planes)
-    ladder: list[tuple[str, Callable[[], tuple[list[Face], np.ndarray]]]] = []
+    ladder: list[tuple[str, Callable[[], Roof]]] = []
     if sections.fitted.any():
         fused = bring_together(faces, planes, sections.sigma, sections.fitted).planes
         ladder += [
-            (lod_label, lambda: (faces, fused)),
-            (lod_label, lambda: (faces, planes)),
-            (lod_label, lambda: (_clipped(faces, fused, ground), fused)),
-            (lod_label, lambda: (faces, _bad_ones_level(faces, planes, ground))),
+            (lod_label, lambda: Roof(faces, fused, ground)),
+            (lod_label, lambda: Roof(faces, planes, ground)),
+            (lod_label, lambda: _clipped(Roof(faces, fused, ground), sections.origin, dtm)),
+            (lod_label, lambda: Roof(faces, _bad_ones_level(faces, planes, ground), ground)),
         ]
     else:
         refused.append(f"{lod_label}: no section has a fitted plane")
-    ladder.append(("1.3", lambda: (faces, _level_sections(faces, planes))))
+    ladder.append(("1.3", lambda: Roof(faces, _level_sections(faces, planes), ground)))
     return _first(ladder, faces, sections, ground, kind, refused) or _nothing(sections, dtm, refused)
 
 
@@ -253,7 +261,7 @@ def _undivided(sections: Sections, dtm: Terrain, lod_label: str, why: Exception)
 
 
 def _first(
-    ladder: list[tuple[str, Callable[[], tuple[list[Face], np.ndarray]]]],
+    ladder: list[tuple[str, Callable[[], Roof]]],
     faces: list[Face],
     sections: Sections,
     ground: int,
@@ -261,23 +269,37 @@ def _first(
     refused: list[str],
 ) -> Solid | None:
     """The solid of the first rung that holds, one flat block being the last; what does not hold is added to `refused`."""
-    last = ("1.2", lambda: (straight.tidied(dissolved(faces)), _one_level(faces, sections.planes)))
-    for lod, roof in [*ladder, last]:
+    last = ("1.2", lambda: Roof(straight.tidied(dissolved(faces)), _one_level(faces, sections.planes), ground))
+    for lod, make in [*ladder, last]:
         try:
-            built = _gated(*roof(), ground, sections.ids if lod != "1.2" else None)
+            roof = make()
+            built = _gated(roof, sections.ids if lod != "1.2" else None)
         except (Refused, *CANNOT) as error:
             refused.append(f"{lod}: {error}")
         else:
-            return Solid(lod, "; ".join(dict.fromkeys(refused)), built, ground, kind, _base(built, sections.origin))
+            return Solid(
+                lod, "; ".join(dict.fromkeys(refused)), built, roof.ground, kind, _base(built, sections.origin)
+            )
     return None
 
 
-def _clipped(faces: list[Face], planes: np.ndarray, ground: int) -> list[Face]:
-    """Faces cut where they come down to the ground. Raises `Refused` if none does."""
-    low = {f.section for f in faces if shells.lowest(f, planes[f.section]) - ground < LOWEST_ROOF * MM}
-    if not low:
+def _clipped(roof: Roof, origin: tuple[int, int], dtm: Terrain) -> Roof:
+    """The roof cut where it comes down to the ground that lies under what stays of it. Raises `Refused` if it nowhere does."""
+    whole = roof
+    while low := {f.section for f in roof.faces if _above(roof, f) < LOWEST_ROOF * MM}:
+        faces = straight.tidied(clip.clipped(roof.faces, roof.planes, low, roof.ground + round(LOWEST_ROOF * MM)))
+        ground = lowest_ground(shapes_of(faces), origin, dtm)
+        if ground <= roof.ground:
+            return roof._replace(faces=faces)
+        roof = roof._replace(faces=faces, ground=ground)
+    if roof is whole:
         raise Refused("no section comes down to the ground")
-    return straight.tidied(clip.clipped(faces, planes, low, ground + round(LOWEST_ROOF * MM)))
+    return roof
+
+
+def _above(roof: Roof, face: Face) -> int:
+    """How high (mm) the lowest corner of a face is above the ground."""
+    return shells.lowest(face, roof.planes[face.section]) - roof.ground
 
 
 def _unusable(face: Face, plane: np.ndarray, ground: int) -> str | None:
@@ -291,8 +313,9 @@ def _unusable(face: Face, plane: np.ndarray, ground: int) -> str | None:
     return None
 
 
-def _gated(faces: list[Face], planes: np.ndarray, ground: int, ids: np.ndarray | None) -> list[list[Surface]]:
+def _gated(roof: Roof, ids: np.ndarray | None) -> list[list[Surface]]:
     """Shells that pass the gate; `ids` None for a roof that is not divided. Raises `Refused` or `NoPartition`."""
+    faces, planes, ground = roof
     for face in faces:
         wrong = _unusable(face, planes[face.section], ground)
         if wrong:
@@ -360,7 +383,7 @@ def _nothing(sections: Sections, dtm: Terrain, refused: list[str]) -> Solid:
     """A building without a solid: its footprint only."""
     outline = shapely.union_all([polygonal(p) for p in sections.polygons])
     ground = 0 if outline.is_empty else lowest_ground([outline], sections.origin, dtm)
-    return Solid("0", "; ".join(dict.fromkeys(refused)), [], ground, "complex", _moved(outline, sections.origin))
+    return Solid("0", "; ".join(dict.fromkeys(refused)), [], ground, None, _moved(outline, sections.origin))
 
 
 def lowest_ground(shapes: list[shapely.Geometry], origin: tuple[int, int], dtm: Terrain) -> int:
@@ -372,7 +395,8 @@ def lowest_ground(shapes: list[shapely.Geometry], origin: tuple[int, int], dtm: 
     centres = np.stack(np.meshgrid(dtm.x0 + cols * dtm.step[0], dtm.y0 - rows * dtm.step[1]), axis=-1).reshape(-1, 2)
     inside = [centres[shapely.contains_xy(shape, *centres.T)] for shape in placed]
     rim = shapely.get_coordinates(shapely.segmentize(placed, min(dtm.step) / 2))
-    return int(np.floor(dtm(np.concatenate([rim, *inside])).min() * MM))
+    lowest = dtm(np.concatenate([rim, *inside])).min() * MM
+    return int(np.floor(lowest + 1e-3))  # between pixels of one height its last digits differ
 
 
 def _moved(geometry: shapely.Geometry, origin: tuple[int, int]) -> shapely.Geometry:

@@ -178,6 +178,34 @@ def test_a_roof_that_dives_into_the_ground_ends_there():
     assert shells_are_valid(solid)
 
 
+def test_a_cut_roof_stands_on_the_ground_under_what_stays_of_it():
+    """On a hillside the lowest ground lies under the part that is cut off."""
+    hillside = terrain.Terrain(
+        np.tile(np.arange(200) * 0.3, (200, 1)), -10.25, 60.0, (0.5, 0.5)
+    )  # rises by 0.6 to the east
+    dives = solids.Sections(
+        np.array([1]), [shapely.box(0, 0, 10, 6)], np.array([[0.9, 0, 5.2]]), ["ok"], np.full(1, 0.1), (0, 0)
+    )
+    solid = solids.build(dives, hillside)
+    assert solid.lod == "2.0"
+    rim = shapely.get_coordinates(shapely.segmentize(solid.base, 0.1))
+    assert solid.ground / 1000 == pytest.approx(hillside(rim).min(), abs=0.002)
+    lowest = min(
+        z for shell in solid.shells for s in shell if s.kind == "RoofSurface" for ring in s.rings for *_, z in ring
+    )
+    assert lowest - solid.ground == pytest.approx(500, abs=2)
+    assert shells_are_valid(solid)
+
+
+def test_flat_ground_has_one_height_everywhere():
+    """What is read between pixels of one height differs from it in the last digits."""
+    for height in (97.3, 120.0):
+        ground = terrain.Terrain(np.full((2, 2), np.float32(height)).astype(float), 0.0, 700.0, (700.0, 700.0))
+        corners = np.random.default_rng(0).uniform(50, 600, (60, 2))
+        found = {solids.lowest_ground([shapely.box(x, y, x + 9.1, y + 7.7)], (0, 0), ground) for x, y in corners}
+        assert found == {round(height * 1000)}
+
+
 def test_of_a_house_only_the_section_that_dives_is_cut():
     house = [*houses.HIP, ([(14, 1), (22, 1), (22, 8), (14, 8)], (-0.5, 0, 10.8))]
     _, solid, row = built(house)
@@ -223,6 +251,7 @@ def test_a_roof_wholly_below_ground_stays_as_a_footprint():
     _, solid, row = built([(ring, (0, 0, -2.0)) for ring, _ in houses.BOX])
     assert (row["lod"], row["valid"], solid.shells) == ("0", False, [])
     assert row["footprint"].area == pytest.approx(20.0)
+    assert (row["volume"], row["height"], row["roof_type"]) == (None, None, None)
     assert "above the ground" in row["lod_reason"]
 
 

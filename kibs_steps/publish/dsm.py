@@ -1,9 +1,9 @@
 """DSM: `dsm.tif`, terrain and buildings as one surface, in the map frame.
 
 In: the scene, its terrain, the blocks' meshes. Out: absolute heights (m, float32), a Cloud Optimized GeoTIFF with the grid's
-pixels laid over where things *stand*: a pixel has the height of the highest roof over its centre, or of the terrain where
-that is higher. What was moved beyond the raster's edge is cut off. Pixels are worked on in windows, so memory does not grow
-with the raster.
+pixels laid over where things *stand* (`scene.standing`): a pixel has the height of the highest roof over its centre, or of
+the terrain where that is higher. What was moved beyond the raster's edge is cut off. Pixels are worked on in windows, so
+memory does not grow with the raster.
 """
 
 from __future__ import annotations
@@ -84,12 +84,13 @@ def main(argv: list[str] | None = None) -> None:
     scene = scenes.read(args.scene)
     found = roofs(meshes(args.meshes))
     tags = {"UNIT": "m", **({"LICENCE": line} if (line := licences.line(args.models)) else {})}
+    grid = scene.standing
     with (
         rasterio.Env(GDAL_CACHEMAX=CACHE),
-        cloud_optimized(args.out, scene.grid, "float32", float("nan"), tags) as target,
+        cloud_optimized(args.out, grid, "float32", float("nan"), tags) as target,
     ):
-        for window in scene.grid.windows(SIDE):
-            frame = scene.grid.part(window)
+        for window in grid.windows(SIDE):
+            frame = grid.part(window)
             target.write(surface(found, frame, scene.terrain(frame.bounds)), 1, window=rasterio.windows.Window(*window))
 
 

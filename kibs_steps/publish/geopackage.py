@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
@@ -101,6 +102,8 @@ def footprints(solids: pa.Table) -> pa.Table:
         shapely.force_2d(shapely.from_wkb(solids["outline"].to_numpy())), return_index=True
     )
     rows = solids.select(list(FOOTPRINT_COLUMNS)).take(pa.array(owner, pa.int64()))
+    own = pa.array(np.round(shapely.area(parts), 3), pa.float64())
+    rows = rows.set_column(rows.column_names.index("footprint_area"), "footprint_area", own)
     return rows.append_column(GEOMETRY, pa.array(shapely.to_wkb(parts), pa.binary()))
 
 

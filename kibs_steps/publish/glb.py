@@ -18,7 +18,7 @@ from PIL import Image
 
 from kibs_steps import cli, picture, store, view
 from kibs_steps import scene as scenes
-from kibs_steps.mesh import COLOURS, KINDS, Mesh, by_kind, meshes
+from kibs_steps.mesh import KINDS, LINEAR, Mesh, by_kind, meshes
 from kibs_steps.publish import licences
 from kibs_steps.publish.gltf import Glb, y_up
 from kibs_steps.scene import Scene
@@ -32,7 +32,7 @@ BY_KIND, IMAGE = 0, 1  # materials
 def coloured(glb: Glb, mesh: Mesh, base: np.ndarray) -> dict[str, Any]:
     """A building coloured by kind as a primitive, in metres from `base`."""
     points, faces, kind = by_kind(mesh)
-    opaque = np.column_stack([COLOURS[kind], np.full(len(kind), 255, np.uint8)])
+    opaque = np.column_stack([LINEAR[kind], np.full(len(kind), 255, np.uint8)])
     colours = glb.accessor("colours", opaque, normalized=True)
     return {**glb.primitive(y_up(points - base), faces, COLOR_0=colours), "material": BY_KIND}
 

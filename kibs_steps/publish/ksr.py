@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from kibs_steps import cli, store, view
 from kibs_steps import scene as scenes
 from kibs_steps.mesh import KINDS, Mesh, area_vectors, meshes, polygons
+from kibs_steps.publish import licences
 
 STEP = 1.0  # m
 APART = 2.0  # m
 AROUND = 8.0  # m
 SIDE = 256  # m, of the squares that the terrain is worked on in
-HEAD = 512  # bytes
+HEAD = 1024  # bytes
 ROW = np.dtype([(n, "<f8") for n in ("x", "y", "z")] + [(n, "<f4") for n in ("nx", "ny", "nz")] + [("label", "u1")])
 
 TerrainOf = Callable[[tuple[float, float, float, float]], view.Surface]  # bounds (map m) to the surface there
@@ -98,7 +99,7 @@ def _rows(points: NDArray[np.float64], normal: NDArray[np.float64], label: NDArr
     return found
 
 
-def write(path: Path, found: Iterable[Mesh], terrain_of: TerrainOf, crs: str) -> int:
+def write(path: Path, found: Iterable[Mesh], terrain_of: TerrainOf, crs: str, licence: str = "") -> int:
     """Write the points of all buildings and the ground round them; returns how many."""
     count, bases = 0, []
     with path.open("wb") as out:
@@ -109,7 +110,7 @@ def write(path: Path, found: Iterable[Mesh], terrain_of: TerrainOf, crs: str) ->
         for points in of_ground(bases, terrain_of):
             count += _append(out, points)
         out.seek(0)
-        out.write(head(count, crs))
+        out.write(head(count, crs, licence))
     return count
 
 
@@ -118,13 +119,14 @@ def _append(out: BinaryIO, points: NDArray[np.void]) -> int:
     return len(points)
 
 
-def head(count: int, crs: str) -> bytes:
+def head(count: int, crs: str, licence: str = "") -> bytes:
     """The header of a PLY with so many points, `HEAD` bytes long."""
     kinds = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {kinds[ROW[name].str]} {name}" for name in ROW.names]
     told = f"comment {crs.splitlines()[0][:120]}, metres; label 0 ground, 1 roof, 2 wall"
-    text = "\n".join([*lines, told]).encode()
+    lines += [told, *([f"comment licence {licence}"] if licence else [])]
+    text = "\n".join(lines).encode("ascii", "replace")[: HEAD - len(b"\nend_header\n")]
     return text.ljust(HEAD - len(b"\nend_header\n")) + b"\nend_header\n"
 
 
@@ -133,11 +135,12 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.ksr", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
     parser.add_argument("--meshes", nargs="+", required=True, help="meshes.parquet of every block")
+    parser.add_argument("--models", nargs="*", default=[], help="models/*.json: their licences are told")
     parser.add_argument("--out", required=True, help="out: ksr/points.ply")
     args = parser.parse_args(argv)
     scene = scenes.read(args.scene)
     with store.whole(args.out) as temporary:
-        write(temporary, meshes(args.meshes), scene.terrain, scene.grid.crs)
+        write(temporary, meshes(args.meshes), scene.terrain, scene.grid.crs, licences.line(args.models))
 
 
 if __name__ == "__main__":

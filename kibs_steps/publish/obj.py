@@ -16,11 +16,14 @@ import numpy as np
 from kibs_steps import cli, store
 from kibs_steps import scene as scenes
 from kibs_steps.mesh import COLOURS, KINDS, Mesh, by_kind, meshes
+from kibs_steps.publish import licences
 from kibs_steps.publish.glb import origin_of
 
 
-def write(out: TextIO, found: Iterable[Mesh], origin: np.ndarray, crs: str, materials: str) -> None:
+def write(out: TextIO, found: Iterable[Mesh], origin: np.ndarray, crs: str, materials: str, licence: str = "") -> None:
     """Write buildings; `origin` (3,) map m."""
+    if licence:
+        out.write(f"# licence {licence}\n")
     out.write(f"# origin {origin[0]:.0f} {origin[1]:.0f} {origin[2]:.0f} in {crs.splitlines()[0]}, metres, z up\n")
     out.write(f"mtllib {materials}\n")
     used = 0
@@ -55,6 +58,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.obj", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
     parser.add_argument("--meshes", nargs="+", required=True, help="meshes.parquet of every block")
+    parser.add_argument("--models", nargs="*", default=[], help="models/*.json: their licences are told")
     parser.add_argument("--out", required=True, help="out: city.obj")
     parser.add_argument("--materials", required=True, help="out: city.mtl, beside it")
     args = parser.parse_args(argv)
@@ -62,7 +66,8 @@ def main(argv: list[str] | None = None) -> None:
     with store.whole(args.materials) as temporary:
         temporary.write_text(materials(), encoding="utf-8")
     with store.whole(args.out) as temporary, temporary.open("w", encoding="utf-8") as out:
-        write(out, meshes(args.meshes), origin_of(scene), scene.grid.crs, Path(args.materials).name)
+        materials_name, licence = Path(args.materials).name, licences.line(args.models)
+        write(out, meshes(args.meshes), origin_of(scene), scene.grid.crs, materials_name, licence)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from kibs_steps import cli, picture, store
 from kibs_steps import scene as scenes
 from kibs_steps.grid import Grid
 from kibs_steps.picture import FINER
+from kibs_steps.publish import licences
 from kibs_steps.scene import Scene
 
 LONGEST = 1200  # px: longer side of a panel
@@ -61,13 +62,13 @@ def shaded(colours: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.flo
     return np.clip(colours * (0.45 + 0.55 * strength)[..., None], 0, 255).astype(np.uint8)
 
 
-def terrain_shade(scene: Scene, size: tuple[int, int], scale: float) -> NDArray[np.uint8]:
-    """The terrain of the grid as a pale relief, (rows, cols, 3) of `size` (width, height) picture pixels."""
+def terrain_shade(scene: Scene, grid: Grid, size: tuple[int, int], scale: float) -> NDArray[np.uint8]:
+    """The terrain of a grid as a pale relief, (rows, cols, 3) of `size` (width, height) picture pixels."""
     step = 4
     cols, rows = np.meshgrid(np.arange(0, size[0] + step, step), np.arange(0, size[1] + step, step))
-    place = scene.grid.to_map(np.stack([cols, rows], axis=-1).reshape(-1, 2) / scale)
-    metres = step * scene.grid.gsd / scale
-    heights = scene.terrain(scene.grid.bounds, step=metres)(place).reshape(cols.shape)
+    place = grid.to_map(np.stack([cols, rows], axis=-1).reshape(-1, 2) / scale)
+    metres = step * grid.gsd / scale
+    heights = scene.terrain(grid.bounds, step=metres)(place).reshape(cols.shape)
     down, along = np.gradient(heights, metres)
     base = np.full((*heights.shape, 3), (232, 231, 225), np.uint8)
     relief = Image.fromarray(shaded(base, 2 * along, -2 * down))
@@ -75,18 +76,19 @@ def terrain_shade(scene: Scene, size: tuple[int, int], scale: float) -> NDArray[
 
 
 def standing_panel(
-    scene: Scene, outlines: NDArray[np.object_], planes: NDArray[np.float64], heights: NDArray[np.float64], size: tuple[int, int],
+    scene: Scene, grid: Grid, outlines: NDArray[np.object_], planes: NDArray[np.float64], heights: NDArray[np.float64],
     scale: float,
 ) -> tuple[Image.Image, float]:  # fmt: skip
-    """The map view: roofs over relief; `outlines` (WKB, px) where they stand, `planes` (n, 2) their gradients, `heights` (n,) m
-    above ground."""
+    """The map view of a grid: roofs over relief; `outlines` (WKB, px of the grid) where they stand, `planes` (n, 2) their
+    gradients, `heights` (n,) m above ground."""
+    size = max(round(grid.width * scale), 1), max(round(grid.height * scale), 1)
     large = (size[0] * FINER, size[1] * FINER)
-    page = Image.fromarray(terrain_shade(scene, size, scale)).resize(large, Image.Resampling.BICUBIC)
+    page = Image.fromarray(terrain_shade(scene, grid, size, scale)).resize(large, Image.Resampling.BICUBIC)
     colours, top = by_height(heights)
     lit = shaded(colours, planes[:, 0], planes[:, 1])
     shadow = Image.new("L", large)
     pen = ImageDraw.Draw(shadow)
-    for shell, *_ in picture.rings(_shadows(outlines, heights, scene.grid.gsd), scale * FINER):
+    for shell, *_ in picture.rings(_shadows(outlines, heights, grid.gsd), scale * FINER):
         pen.polygon(shell, fill=110)
     shadow = shadow.filter(ImageFilter.GaussianBlur(1.2 * FINER))
     page.paste((40, 44, 60), (0, 0), shadow)
@@ -151,7 +153,8 @@ class Shown(NamedTuple):
 
 
 def shown(tables: Iterable[pa.Table], scale: float, grid: Grid) -> Shown:
-    """Reads sections (`buildings.parquet`), some at a time; `scale` is picture pixels per pixel of the grid.
+    """Reads sections (`buildings.parquet`), some at a time; `grid` has them where they stand, `scale` is picture pixels per
+    pixel.
 
     Outlines are kept as WKB: of a large city, geometries would be most of the memory.
     """
@@ -175,13 +178,14 @@ def shown(tables: Iterable[pa.Table], scale: float, grid: Grid) -> Shown:
 def preview(scene: Scene, tables: Iterable[pa.Table]) -> Image.Image:
     """The whole picture of a scene's sections (`buildings.parquet`, in order of ids)."""
     rgb, scale = picture.overview(scene, LONGEST)
-    seen, standing, area, building, value = shown(tables, scale, scene.grid)
+    grid = scene.standing
+    seen, standing, area, building, value = shown(tables, scale, grid)
     facing = picture.directions(value["slope"], value["azimuth"])
     typical = np.sqrt(np.median(area)) * scale if len(seen) else 10.0
     width = float(np.clip(typical / 18, 0.5, 1.6))  # thin lines over many small roofs
     left = picture.paint(rgb, seen, facing, scale, cover=0.42, width=width)
     gradients = np.column_stack([value["plane_a"], value["plane_b"]])
-    right, top = standing_panel(scene, standing, gradients, value["height_mean"], left.size, scale)
+    right, top = standing_panel(scene, grid, standing, gradients, value["height_mean"], scale)
 
     note = f"{len(seen):,} roof sections" + (f", {len(np.unique(building)):,} buildings" if len(seen) else "")
     titles = ["as seen from the satellite", "where they stand"]
@@ -200,9 +204,11 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.publish.preview", description=main.__doc__)
     parser.add_argument("--scene", required=True, help="scene.json")
     parser.add_argument("--sections", required=True, nargs="+", help="buildings.parquet")
+    parser.add_argument("--models", nargs="*", default=[], help="models/*.json: their licences are told")
     parser.add_argument("--out", required=True, help="out: preview.png")
     args = parser.parse_args(argv)
-    picture.write(args.out, preview(scenes.read(args.scene), store.merged(args.sections, ["section_id"], COLUMNS)))
+    page = preview(scenes.read(args.scene), store.merged(args.sections, ["section_id"], COLUMNS))
+    picture.write(args.out, page, licences.line(args.models))
 
 
 if __name__ == "__main__":

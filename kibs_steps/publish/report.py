@@ -36,6 +36,11 @@ def _text(value: Any) -> str:
     return "unknown" if value is None else str(value)
 
 
+def _identity(item: Mapping[str, Any]) -> tuple[str, str]:
+    """An input's name and what tells its content: sha256, or a remote source's version."""
+    return item["file"], item.get("sha256") or ", ".join(str(part) for part in item["version"] if part)
+
+
 def page(run: Mapping[str, Any], evaluation: Mapping[str, Any] | None, pictures: Mapping[str, bytes]) -> str:
     """The page; `pictures` are PNG files by title."""
     scene, found = run["scene"], run["results"]
@@ -76,7 +81,7 @@ def page(run: Mapping[str, Any], evaluation: Mapping[str, Any] | None, pictures:
         for step, t in run["times"].items()
     }
     parts.append(table("Time", spent))
-    parts.append(table("Inputs (sha256)", {item["file"]: item["sha256"] for item in run["inputs"]}))
+    parts.append(table("Inputs (sha256; of remote ones what their server says)", dict(map(_identity, run["inputs"]))))
     parts.append(table("Models (sha256)", {item["file"]: item["sha256"] for item in run["models"]}))
     parts.append(table("Versions", run["versions"]))
     return "\n".join(part for part in parts if part) + "\n"

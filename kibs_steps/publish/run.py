@@ -23,6 +23,7 @@ import pyarrow as pa
 from kibs_steps import cli, fingerprint, sources, store
 from kibs_steps import scene as scenes
 from kibs_steps.errors import KibsError
+from kibs_steps.grid import Tiling
 from kibs_steps.publish import licences
 from kibs_steps.scene import Scene
 
@@ -45,6 +46,12 @@ LIBRARIES = (
 MOST = 20  # reasons listed
 SIMPLER = ("1.3", "1.2", "0")  # levels of detail below a full roof, whatever that is called
 MOSTLY = 0.9
+NUMBER = re.compile(r"(?P<level>(?:^|(?<=; )|(?<=^\d\.\d and ))\d(?:\.\d)?(?= and \d|: ))|-?\d[\d,]*(?:\.\d+)?")
+# Formats are written beside `run.json`; which are done by then is chance.
+FORMATS = {
+    "cityjson", "dsm", "evaluation", "geopackage", "glb", "ksr", "obj", "paper_picture", "points", "preview", "rasters",
+    "tiles3d", "viewer",
+}  # fmt: skip
 
 
 class InputMissing(KibsError):
@@ -119,8 +126,9 @@ def counted(values: list[Any]) -> dict[str, int]:
 
 
 def reasons(texts: list[str | None]) -> dict[str, int]:
-    """How often each reason was given, its numbers left out so that like reasons count together; the `MOST` frequent."""
-    alike = [re.sub(r"-?\d[\d,]*(\.\d+)?", "#", text) for text in texts if text]
+    """How often each reason was given, its numbers but levels of detail left out so that like reasons count together; the `MOST`
+    frequent."""
+    alike = [NUMBER.sub(lambda found: found["level"] or "#", text) for text in texts if text]
     return dict(list(counted(alike).items())[:MOST])
 
 
@@ -166,16 +174,20 @@ def lod2(sections: pa.Table, solids: pa.Table) -> dict[str, Any]:
     }
 
 
-def times(folder: str | Path) -> dict[str, dict[str, float | int]]:
-    """Jobs, seconds (sum and longest) and peak memory (MB) per step, from Snakemake's benchmark files below `folder`.
+def times(folder: str | Path, blocks: set[str]) -> dict[str, dict[str, float | int]]:
+    """Jobs, seconds (sum and longest) and peak memory (MB) per step of the city, from Snakemake's benchmark files below `folder`.
 
-    A step is a file `STEP.tsv` or a folder `STEP/` with one file per block.
+    A step is a file `STEP.tsv` or a folder `STEP/` with one file per block; `blocks` are those the scene has, as files of others
+    may be left from a run with another `block`. Formats do not count (`FORMATS`).
     """
     steps: dict[str, list[tuple[float, float]]] = {}
     folder = Path(folder)
     for path in sorted(folder.rglob("*.tsv")):
         place = path.relative_to(folder)
-        step = place.parts[0] if len(place.parts) > 1 else place.stem
+        of_block = len(place.parts) > 1
+        step = place.parts[0] if of_block else place.stem
+        if step in FORMATS or (of_block and place.stem not in blocks):
+            continue
         with path.open(newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file, delimiter="\t"):
                 try:
@@ -219,6 +231,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--solids", required=True, nargs="+", help="solids.parquet of all blocks")
     parser.add_argument("--blocks", help="failed.json: blocks the city is made without, and why")
     parser.add_argument("--benchmarks", help="folder of Snakemake's benchmark files")
+    parser.add_argument("--tile", type=int, required=True, help="tile side, px")
+    parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
+    parser.add_argument("--block", type=int, required=True, help="block side in tiles")
     parser.add_argument("--out", required=True, help="out: run.json")
     args = parser.parse_args(argv)
     scene = scenes.read(args.scene)
@@ -230,6 +245,8 @@ def main(argv: list[str] | None = None) -> None:
         )
     )
     line = licences.line(args.models)
+    tiling = Tiling(args.tile, args.margin, args.block)
+    names = {block.name for block in tiling.blocks(scene.grid.width, scene.grid.height)}
     content = {
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "scene": facts(scene),
@@ -239,7 +256,7 @@ def main(argv: list[str] | None = None) -> None:
         "inputs": inputs(args.inputs, scene.folder.parent / ".fingerprints.json"),
         "results": results(sections, solids),
         "failed_blocks": store.read_json(args.blocks) if args.blocks else {},
-        "times": times(args.benchmarks) if args.benchmarks else {},
+        "times": times(args.benchmarks, names) if args.benchmarks else {},
         "versions": versions(),
     }
     store.write_json(args.out, content)

@@ -23,7 +23,7 @@ import pyproj
 
 from kibs_steps import cli, georeference, store, verify
 from kibs_steps import scene as scenes
-from kibs_steps.mesh import COLOURS, Mesh, by_kind, read
+from kibs_steps.mesh import LINEAR, Mesh, by_kind, read
 from kibs_steps.publish import licences
 from kibs_steps.publish.glb import MATT
 from kibs_steps.publish.gltf import Glb, y_up
@@ -45,7 +45,7 @@ class Earth:
             up = pyproj.CRS.from_user_input(vertical)
             whole = pyproj.crs.CompoundCRS(f"{known.name} + {up.name}", [known, up])
         self.geocentric = pyproj.Transformer.from_crs(whole, GEOCENTRIC, always_xy=True)
-        degrees = pyproj.Transformer.from_crs(known, known.geodetic_crs, always_xy=True)
+        degrees = pyproj.Transformer.from_crs(known, georeference.DEGREES, always_xy=True)
         lon, lat = np.radians(degrees.transform(x, y))
         east = [-np.sin(lon), np.cos(lon), 0.0]
         north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
@@ -73,7 +73,7 @@ def content(path: Path, found: list[Mesh], earth: Earth) -> np.ndarray:
         points, index, kind = by_kind(mesh)
         every.append(points)
         faces.append(index + used)
-        colours.append(COLOURS[kind])
+        colours.append(LINEAR[kind])
         number.append(np.full(len(points), k, np.float32))
         used += len(points)
     points, colour = earth.local(np.concatenate(every)), np.concatenate(colours)

@@ -83,6 +83,30 @@ def test_glb_has_a_node_per_building_with_its_attributes(town, tmp_path):
         np.testing.assert_allclose([placed.min(axis=0), placed.max(axis=0)], [low, high], atol=2e-3)
 
 
+def test_vertex_colours_are_light_as_gltf_takes_them(town, tmp_path):
+    _, arguments = town
+    glb.main([*arguments, "--out", str(tmp_path / "city.glb")])
+    found = set()
+    for body in trimesh.load(tmp_path / "city.glb").geometry.values():
+        colours = body.visual.vertex_attributes["color"]
+        found |= {tuple(c) for c in np.asarray(colours)[:, :3].tolist()}
+    for colour in mesh.COLOURS / 255:
+        light = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+        assert tuple(np.rint(255 * light).astype(int).tolist()) in found
+    assert len(found) == 3
+
+
+def test_files_without_fields_for_it_tell_the_licence_too(town, tmp_path):
+    _, arguments = town
+    contract = {"trained_on": {"licence": "CC BY-NC 4.0"}}
+    (tmp_path / "m.json").write_text(json.dumps({"file": "x/corners.onnx", "contract": contract}))
+    arguments = [*arguments, "--models", str(tmp_path / "m.json")]
+    obj.main([*arguments, "--out", str(tmp_path / "city.obj"), "--materials", str(tmp_path / "city.mtl")])
+    ksr.main([*arguments, "--out", str(tmp_path / "points.ply")])
+    for name in ("city.obj", "points.ply"):
+        assert b"licence corners.onnx: CC BY-NC 4.0" in (tmp_path / name).read_bytes()[:1024]
+
+
 def test_roofs_wear_the_image_where_they_are_seen(town, tmp_path):
     folder, arguments = town
     out = tmp_path / "city.glb"
@@ -225,6 +249,36 @@ def test_dsm_is_terrain_with_roofs(town, tmp_path):
     col, row = scene.grid.to_image(place)[0].astype(int)
     base = float(toy_city.GROUND.at(np.array([(toy_city.X0 + 10, toy_city.Y0 - 50)]))[0]) + city.EAVES
     assert heights[row, col] == pytest.approx(base + 6 + 0.75 * 4.5, abs=0.4)
+
+
+def test_dsm_lies_where_the_ground_stands_that_the_image_shows(town, tmp_path):
+    """Projected on a height 100 m below the ground, the image shows it 58 m beside its place."""
+    folder, arguments = town
+    facts = json.loads((folder / "scene.json").read_text())
+    base = float(toy_city.GROUND.at(np.array([[toy_city.X0, toy_city.Y0]]))[0])
+    (tmp_path / "scene.json").write_text(json.dumps({**facts, "projection_height": base - 100, "displaced": 80.0}))
+    shutil.copy(folder / "dtm.tif", tmp_path)
+    dsm.main(["--scene", str(tmp_path / "scene.json"), *arguments[2:], "--out", str(tmp_path / "dsm.tif")])
+    made = scenes.read(tmp_path / "scene.json")
+    with rasterio.open(tmp_path / "dsm.tif") as source:
+        centre = np.array([source.xy(source.height // 2, source.width // 2)])
+        middle = (source.read(1)[source.height // 2, source.width // 2], source.bounds)
+    assert middle[0] >= toy_city.GROUND.at(centre)[0] - 0.05
+    left, bottom, right, top = made.grid.bounds
+    rims = np.array(
+        [
+            [left, (bottom + top) / 2],
+            [right, (bottom + top) / 2],
+            [(left + right) / 2, bottom],
+            [(left + right) / 2, top],
+        ]
+    )
+    stands, _ = view.ground_position(
+        rims, np.zeros(4), made.terrain(made.grid.bounds), made.lean, made.projected_on(None)
+    )
+    assert np.hypot(*(stands - rims).T).min() > 40
+    bounds = [stands[0, 0], stands[2, 1], stands[1, 0], stands[3, 1]]
+    np.testing.assert_allclose(middle[1], bounds, atol=12)  # the ground slopes
 
 
 def test_viewer_is_one_file_that_asks_for_nothing(town, tmp_path):

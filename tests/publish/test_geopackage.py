@@ -215,3 +215,4 @@ def test_a_building_of_parts_has_a_footprint_row_for_each():
     found = geopackage.footprints(pa.Table.from_pylist(table))
     assert shapely.area(shapely.from_wkb(found["geom"].to_pylist())).tolist() == [80, 64]
     assert found["building_id"].to_pylist() == [table[0]["building_id"]] * 2
+    assert found["footprint_area"].to_pylist() == [80, 64]

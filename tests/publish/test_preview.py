@@ -60,9 +60,9 @@ def test_roofs_are_painted_where_they_are(tmp_path):
     """On the right panel a roof's own colour fills its place on the map; the courtyard is ground."""
     scene = toy.make_scene(tmp_path)
     outline = toy.roofs()[2][2]
-    size, scale = (scene.grid.width * 2, scene.grid.height * 2), 2.0
+    scale = 2.0
     seen = shapely.to_wkb(shapely.transform([outline], scene.grid.to_image))
-    panel, _ = preview.standing_panel(scene, seen, np.zeros((1, 2)), np.array([25.0]), size, scale)
+    panel, _ = preview.standing_panel(scene, scene.grid, seen, np.zeros((1, 2)), np.array([25.0]), scale)
     pixels = np.asarray(panel).astype(int)
     colour = preview.by_height(np.array([25.0]))[0][0]
     for point, is_roof in (((82, 62), True), ((108, 88), True), ((95, 75), False), ((40, 20), False)):

@@ -17,7 +17,10 @@ RUN = {
         "buildings": {"count": 1, "lod": {"2.0": 1}, "roof_type": {"gable": 1}, "reasons": {}},
     },
     "times": {"solids": {"seconds": 1.25, "jobs": 2, "peak_mb": 120.0}},
-    "inputs": [{"file": "a.tif", "sha256": "ab12"}],
+    "inputs": [
+        {"file": "a.tif", "sha256": "ab12"},
+        {"file": "https://x.org/b.tif", "version": [None, "Mon, 1 Jan", "7"]},
+    ],
     "models": [],
     "versions": {"numpy": "2.0"},
 }
@@ -35,6 +38,7 @@ def test_everything_is_told_and_nothing_is_markup():
         "0.812",
         "1.2 s in 2 jobs",
         "ab12",
+        "Mon, 1 Jan, 7",
     ):
         assert told in text, told
     assert "made without the blocks" in text

@@ -55,6 +55,8 @@ def test_everything_is_recorded(tmp_path, capsys):
         "scene.tsv": "s\th:m:s\tmax_rss\n1.5\t0:00:01\t120.5\n",
         "planes/r000c000.tsv": "s\th:m:s\tmax_rss\n2.0\t0:00:02\t90\n",
         "planes/r000c001.tsv": "s\th:m:s\tmax_rss\n0.5\t0:00:00\t-\n",
+        "planes/r003c000.tsv": "s\th:m:s\tmax_rss\n9.0\t0:00:09\t90\n",  # of larger tiles, once
+        "glb.tsv": "s\th:m:s\tmax_rss\n9.0\t0:00:09\t90\n",
     }.items():
         path = tmp_path / "benchmarks" / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +70,18 @@ def test_everything_is_recorded(tmp_path, capsys):
         "--models",
         tmp_path / "corners.json",
     ]
-    arguments += ["--settings", '{"planes": "robust"}', "--sections", tmp_path / "buildings.parquet"]
+    arguments += [
+        "--tile",
+        64,
+        "--margin",
+        8,
+        "--block",
+        4,
+        "--settings",
+        '{"planes": "robust"}',
+        "--sections",
+        tmp_path / "buildings.parquet",
+    ]
     arguments += ["--solids", tmp_path / "solids.parquet", "--benchmarks", tmp_path / "benchmarks", "--out", out]
     run.main([str(a) for a in arguments])
     assert "corners.onnx: CC BY-NC 4.0" in capsys.readouterr().out
@@ -88,8 +101,18 @@ def test_everything_is_recorded(tmp_path, capsys):
     assert list(buildings["reasons"].values()) == [1]
     assert found["times"]["planes"] == {"jobs": 2, "seconds": 2.5, "longest": 2.0, "peak_mb": 90.0}
     assert found["times"]["scene"]["jobs"] == 1
+    assert "glb" not in found["times"]
     assert found["versions"]["numpy"]
     assert found["scene"]["position_corrected"]
+
+
+def test_reasons_count_together_and_keep_their_level():
+    texts = [
+        "2.0: face 5 is 12.5 mm off its plane; 1.3: it has 2 parts",
+        "2.0: face 16 is 3 mm off its plane; 1.3: it has 4 parts",
+    ]
+    assert run.reasons(texts) == {"2.0: face # is # mm off its plane; 1.3: it has # parts": 2}
+    assert run.reasons(["2.0 and 1.3: no section has an area", None]) == {"2.0 and 1.3: no section has an area": 1}
 
 
 def test_regions_alone_move_roofs_too(tmp_path):

@@ -115,6 +115,7 @@ rule preview:
         scene=given("results/{scene}/scene.json"),
         raster=given(lambda w: sources.files(plan(w).raster)),
         sections=given("results/{scene}/buildings.parquet"),
+        models=given(licensed),
     output:
         "results/{scene}/preview.png",
     log:
@@ -127,7 +128,7 @@ rule preview:
         signature=signature("buildings"),
     shell:
         "python -m kibs_steps.publish.preview --scene {input.scene:q} --sections {input.sections:q}"
-        " --out {output:q} > {log:q} 2>&1"
+        " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs("glb", "results/{scene}/city.glb")
@@ -165,6 +166,7 @@ rule obj:
     input:
         scene=given("results/{scene}/scene.json"),
         meshes=given(blocks("meshes.parquet")),
+        models=given(licensed),
     output:
         city="results/{scene}/city.obj",
         materials="results/{scene}/city.mtl",
@@ -178,7 +180,7 @@ rule obj:
         signature=signature("solids"),
     shell:
         "python -m kibs_steps.publish.obj --scene {input.scene:q} --meshes {input.meshes:q}"
-        " --out {output.city:q} --materials {output.materials:q} > {log:q} 2>&1"
+        " --models {input.models:q} --out {output.city:q} --materials {output.materials:q} > {log:q} 2>&1"
 
 
 given = inputs("solids", "results/{scene}/tiles3d/tileset.json")
@@ -239,6 +241,7 @@ rule ksr:
         scene=given("results/{scene}/scene.json"),
         dtm=given("results/{scene}/dtm.tif"),
         meshes=given(blocks("meshes.parquet")),
+        models=given(licensed),
     output:
         "results/{scene}/ksr/points.ply",
     log:
@@ -251,7 +254,7 @@ rule ksr:
         signature=signature("solids"),
     shell:
         "python -m kibs_steps.publish.ksr --scene {input.scene:q} --meshes {input.meshes:q}"
-        " --out {output:q} > {log:q} 2>&1"
+        " --models {input.models:q} --out {output:q} > {log:q} 2>&1"
 
 
 given = inputs("solids", "results/{scene}/viewer.html")
@@ -333,12 +336,14 @@ rule record:
         signature=signature("run"),
         settings=lambda w: json.dumps(plan(w).settings),
         remote=lambda w: plan(w).remote,
+        tiling=lambda w: plan(w).tiling,
         blocks=failed,
         reasons=why_failed,
     shell:
         "python -m kibs_steps.publish.run --scene {input.scene:q} --inputs {input.sources:q} {params.remote:q} --models {input.models:q}"
         " --settings {params.settings:q} --sections {input.sections:q} --solids {input.solids:q}"
-        " {params.blocks:q} --benchmarks results/{wildcards.scene}/benchmarks --out {output:q} > {log:q} 2>&1"
+        " --tile {params.tiling.tile} --margin {params.tiling.margin} --block {params.tiling.block} {params.blocks:q}"
+        " --benchmarks results/{wildcards.scene}/benchmarks --out {output:q} > {log:q} 2>&1"
 
 
 rule scene_report:

@@ -45,7 +45,7 @@ function hsv(hue, strength, light) {
   const MODES = {
     "height above ground": {
       of: (s) => (kind[s] === 0 ? ramp(buildings.height[ofSurface[s]] / highest) : WALL),
-      key: () => HEIGHTS.map((c, i) => [c, `${((i / (HEIGHTS.length - 1)) * highest).toFixed(0)} m`]),
+      key: () => HEIGHTS.map((c, i) => [c, `${+((i / (HEIGHTS.length - 1)) * highest).toFixed(1)} m`]),
     },
     "slope and direction": {
       of: (s) => (kind[s] === 0 ? (azimuth[s] === 65535 ? [0.94, 0.94, 0.94] : hsv(azimuth[s], Math.min(0.15 + slope[s] * 0.018, 0.75), 0.94)) : WALL),
