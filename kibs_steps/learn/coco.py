@@ -22,13 +22,21 @@ import numpy as np
 
 from kibs_steps import cli, photographs, store
 from kibs_steps.errors import KibsError
-from kibs_steps.learn.samples import UNKNOWN, Sample
+from kibs_steps.learn.samples import CORRECTED, UNKNOWN, Sample, contents
 
 if TYPE_CHECKING:
     from pycocotools.coco import COCO
 
 SQUARE = 15  # px: side q of a corner's square (PAPER, data and tiling)
 SECTION = 1  # category id
+ROOFS = (
+    "section",
+    "sections",
+    "roof",
+    "roofs",
+    "roof_section",
+    "roof_sections",
+)  # names of categories that are roof sections
 UNMOVED = 0.5  # px between a square and that of its exact corner
 
 
@@ -152,6 +160,7 @@ def read(folder: str | Path, images: str | Path | None = None) -> Iterator[tuple
     sections = _opened(folder / "sections.json")
     corners = _opened(folder / "corners.json") if (folder / "corners.json").is_file() else None
     by_name = {image["file_name"]: key for key, image in corners.imgs.items()} if corners else {}
+    roofs = roofs_of(sections, folder / "sections.json")
     for key in sorted(sections.imgs):
         image = sections.imgs[key]
         rgb = cv2.imread(str(pictures / image["file_name"]), cv2.IMREAD_COLOR)
@@ -161,7 +170,7 @@ def read(folder: str | Path, images: str | Path | None = None) -> Iterator[tuple
                 f"{pictures / image['file_name']} is {found}, {folder / 'sections.json'} speaks of "
                 f"{image['width']}×{image['height']} px: put images and annotations of one export together"
             )
-        sample = _with_sections(Sample.ground(np.ascontiguousarray(rgb[..., ::-1])), sections, key)
+        sample = _with_sections(Sample.ground(np.ascontiguousarray(rgb[..., ::-1])), sections, key, roofs)
         sample = _with_corners(sample, corners, by_name.get(image["file_name"]))
         geometry = np.asarray(image.get("geometry", np.zeros(6)), np.float32)
         yield Path(image["file_name"]).stem, sample._replace(geometry=geometry)
@@ -193,10 +202,25 @@ def _opened(path: Path) -> COCO:
     return index
 
 
-def _with_sections(sample: Sample, index: COCO, key: int) -> Sample:
+def roofs_of(index: COCO, path: Path) -> set[int]:
+    """The categories of roof sections: of several those that are called so (`ROOFS`). Raises `BadAnnotations` if none is."""
+    names = {
+        key: str(category.get("name", "")).strip().lower().replace(" ", "_") for key, category in index.cats.items()
+    }
+    found = {key for key, name in names.items() if len(names) == 1 or name in ROOFS}
+    if not found:
+        raise BadAnnotations(
+            f"{path} has the categories {', '.join(sorted(names.values()))}: call that of roof sections one of {', '.join(ROOFS)}"
+        )
+    return found
+
+
+def _with_sections(sample: Sample, index: COCO, key: int, roofs: set[int]) -> Sample:
     labels, roof = sample.labels.copy(), sample.roof.copy()
     number = 0
     for annotation in sorted(index.imgToAnns[key], key=lambda a: (-a.get("iscrowd", 0), a["id"])):
+        if annotation["category_id"] not in roofs:
+            continue
         where = index.annToMask(annotation) > 0
         if annotation.get("iscrowd", 0):
             labels[where], roof[where] = -1, annotation.get("roof", UNKNOWN)
@@ -249,6 +273,9 @@ def main(argv: list[str] | None = None) -> None:
     if args.to == "samples":
         for name, sample in read(args.coco):
             sample.save(Path(args.samples) / f"{name}.npz")
+        own = Path(args.samples).parent
+        if (own / "own.json").is_file():  # a run that learned from them as they were has to know
+            store.write_json(own / CORRECTED, contents(own), summed=False)
         return
     files = sorted(Path(args.samples).glob("[!.]*.npz"))
     if not files:

@@ -171,6 +171,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--model", required=True, help="ONNX file of a dense model for sections, or both; gets `join`")
     parser.add_argument("--scenes", type=int, default=120, help="simulated scenes of a tile each to learn from")
     parser.add_argument("--steps", type=int, default=fitting.STEPS, help="of learning, each of four times")
+    parser.add_argument(
+        "--prominence",
+        type=float,
+        default=PROMINENCE,
+        help="of a basin's summit: lower ones are joined before all others",
+    )
     parser.add_argument("--data", help="data folder with roof photographs, which some of them show")
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
     parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
@@ -195,7 +201,7 @@ def main(argv: list[str] | None = None) -> None:
         maps.append(runtime.open_network(model, samples[-1].geometry[None], threads=1)(samples[-1].rgb))
         if number % 20 == 19:
             print(f"{number + 1} of {args.scenes} scenes", flush=True)
-    contract = {**model.contract, "thresholds": {**model.contract["thresholds"], "prominence": PROMINENCE}}
+    contract = {**model.contract, "thresholds": {**model.contract["thresholds"], "prominence": args.prominence}}
     lessons = [lesson(shown, sample, contract["thresholds"]) for shown, sample in zip(maps, samples, strict=True)]
     try:
         contract["join"] = policy(lessons, steps=args.steps)

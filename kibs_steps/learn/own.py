@@ -29,7 +29,7 @@ from kibs_steps.errors import KibsError
 from kibs_steps.georeference import SAME_GSD
 from kibs_steps.grid import Window
 from kibs_steps.learn import dataset, guessed
-from kibs_steps.learn.samples import UNKNOWN, Sample
+from kibs_steps.learn.samples import CORRECTED, UNKNOWN, Sample
 from kibs_steps.models import contract as contracts
 from kibs_steps.models import runtime
 from kibs_steps.scene import Scene
@@ -100,18 +100,21 @@ def section_sample(scene: Scene, sections: Truth, window: Window, unknown: NDArr
     vertices = metrics.merge_corners(evaluate.truth_corners(sections, seen, window))
     seen, height = seen[2:-2, 2:-2], height[2:-2, 2:-2]
     blank = unknown | ~valid
-    _, labels = np.unique(np.append(seen.ravel(), 0), return_inverse=True)
-    labels = labels[:-1].reshape(seen.shape).astype(np.int32)
-    labels[blank] = -1
+    _, whole = np.unique(np.append(seen.ravel(), 0), return_inverse=True)
+    whole = whole[:-1].reshape(seen.shape).astype(np.int32)
+    # Of a roof that goes on where nothing is known neither rim nor middle are; it is roof all the same.
+    cut = np.unique(whole[cv2.dilate(blank.astype(np.uint8), np.ones((3, 3))) > 0])
+    labels = np.where(blank | np.isin(whole, cut[cut > 0]), -1, whole).astype(np.int32)
+    roof = (whole > 0) & ~blank
     place = vertices.place - [window.col, window.row]
     shown = vertices.seen.copy()
     row, col = np.clip(np.floor(place[:, ::-1]).astype(int), 0, window.width - 1).T
     shown &= ~blank[row, col]
     return Sample.ground(rgb)._replace(
         labels=labels,
-        roof=np.where(blank, UNKNOWN, labels > 0).astype(np.uint8),
-        height=np.where(labels > 0, height, np.nan).astype(np.float32),
-        surface=np.where(labels > 0, rendering.ON_ROOF, UNKNOWN).astype(np.uint8),
+        roof=np.where(blank, UNKNOWN, roof).astype(np.uint8),
+        height=np.where(roof, height, np.nan).astype(np.float32),
+        surface=np.where(roof, rendering.ON_ROOF, UNKNOWN).astype(np.uint8),
         corners=place[shown].astype(np.float32),
         corner_heights=vertices.height[shown].astype(np.float32),
         corners_known=(~blank).astype(np.uint8),
@@ -157,11 +160,17 @@ def _bounds(window: Window) -> tuple[int, int, int, int]:
 
 
 def outlines_on(scene: Scene, path: str | Path) -> NDArray[np.object_]:
-    """Polygons of a vector file in image coordinates (px), as they are drawn: nothing is moved by the view."""
+    """Polygons of a vector file in image coordinates (px), as they are drawn: nothing is moved by the view.
+
+    Raises `NoOverlap` where none lies in the raster.
+    """
     layer = truth.read_layer(path, "image")
     flat = layer._replace(polygons=shapely.force_3d(shapely.force_2d(layer.polygons), 0.0))
     on_grid = truth.to_grid(flat, scene.grid)
-    return shapely.transform(shapely.force_2d(on_grid), scene.grid.to_image)
+    found = shapely.transform(shapely.force_2d(on_grid), scene.grid.to_image)
+    if not shapely.intersects(found, shapely.box(0, 0, scene.grid.width, scene.grid.height)).any():
+        raise truth.NoOverlap(f"{path}: no polygon lies in {scene.raster}: check the layer's CRS and place")
+    return found
 
 
 def codes_of(points: NDArray[np.float64], found: list[Place], code: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -286,6 +295,11 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> None:
     """Make training samples of a raster and its annotation."""
     args = _arguments(argv)
+    if (corrected := args.out / CORRECTED).exists():
+        raise NothingToLearn(
+            f"{corrected}: the samples there were corrected by hand and would be lost: choose another --out (train.own: name), "
+            f"or delete {args.out}"
+        )
     dtm = float(args.dtm) if _is_number(args.dtm) else args.dtm
     scene = scenes.build(
         args.out.name,
@@ -300,6 +314,13 @@ def main(argv: list[str] | None = None) -> None:
         projection_height=args.projection_height,
     )
     found = places(scene.grid.width, scene.grid.height, args.tile)
+    annotated = outlines_on(scene, args.annotated) if args.annotated else None
+    if annotated is not None:  # the shares are those of what is known
+        found = [place for place in found if drawn(annotated, place.window).any()]
+        if not found:
+            raise NothingToLearn(
+                f"{args.annotated} covers no pixel of {args.raster}: draw areas within which every roof is drawn"
+            )
     rule = "none" if args.guess else args.split
     teacher = teaching(args.guess, scene, args.tile) if args.guess else None
     if teacher:
@@ -308,7 +329,11 @@ def main(argv: list[str] | None = None) -> None:
     else:
         blocks = rule == "blocks"
         code = in_blocks(found, args.seed, args.square, args.buffer) if blocks else shuffled(len(found), args.seed)
-    annotated = outlines_on(scene, args.annotated) if args.annotated else None
+        if not (code == 0).any():
+            raise NothingToLearn(
+                f"{args.raster}: none of its {len(found)} tiles is for training (--split {rule} --seed {args.seed}): choose "
+                "--split shuffle (split: shuffle), or another seed"
+            )
     sections, buildings = None, np.zeros(0, object)
     if args.truth:
         layer = truth.read_layer(args.truth, args.truth_frame)
@@ -331,7 +356,7 @@ def main(argv: list[str] | None = None) -> None:
             sample = building_sample(scene, buildings, window, unknown)
         else:
             sample = section_sample(scene, sections, window, unknown)
-        if teacher and (sample.roof == UNKNOWN).all():
+        if (sample.roof == UNKNOWN).all() and not sample.corners_known.any():
             code[number] = LEFT_OUT
             continue
         roofs += int((sample.roof == 1).sum())

@@ -52,7 +52,8 @@ ALONE = {"sections": ("sections",)}
 class Recipe(NamedTuple):
     """One `train`: the set's name, model by task -> network, models that are taken as they are by task, options of `learn.own` by
     data, of `learn.look` by scene, of `learn.training` by network, of `learn.export` by task, there of `learn.joins` too where
-    basins are joined; the weights that a network starts from, and the model that the one of a task is like (no file or one)."""
+    basins are joined; the weights that a network starts from, the model that the one of a task is like (no file or one), and
+    the files of the cities that tiles show."""
 
     name: str
     network_of: dict[str, str]
@@ -64,6 +65,7 @@ class Recipe(NamedTuple):
     joins: dict[str, list[str]]
     starts: dict[str, list[str]]
     like: dict[str, list[str]]
+    cities: list[str]
 
     def files(self, own: str) -> list[str]:
         """The files of one own data set that are there."""
@@ -163,18 +165,21 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
         starts[network] = [str(weights(train["init"], network, base))] if train["init"] else []
         training[network] = [*options, f"--task={network}"]
     network_of = {task: network for network, tasks in exports.items() for task in tasks}
+    cities = _files(train["cities"])
     models = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
     like = {task: [str(path)] if path else [] for task, path in models.items()}
     thresholds = [f"--thresholds={json.dumps(train['thresholds'])}"] if train["thresholds"] else []
     export = {task: thresholds if task != "corners" else [] for task in network_of}
     shown = [f"--scenes={train['joins']}"]
+    if "prominence" in train["thresholds"]:
+        shown.append(f"--prominence={train['thresholds']['prominence']}")
     shown += [f"--data={train['data']}"] if train["data"] and not train["free"] else []
     for key in ("cities", "leave_out"):
         shown += [f"--{key.replace('_', '-')}", *map(str, train[key])] if train[key] else []
     shown += ["--untold", *untold] if untold else []
     joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
     joins = {task: shown if task in joining else [] for task in network_of}
-    return Recipe(str(train["name"]), network_of, taken, own, look, training, export, joins, starts, like)
+    return Recipe(str(train["name"]), network_of, taken, own, look, training, export, joins, starts, like, cities)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:

@@ -5,14 +5,16 @@ The one shape that all sources of training data (`dataset`, `own`) give and all 
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from kibs_steps import store
+from kibs_steps import fingerprint, store
 
 UNKNOWN = 255
+CORRECTED = "corrected.json"  # beside sets of samples that were corrected by hand: their `contents`
 
 
 class Sample(NamedTuple):
@@ -67,3 +69,13 @@ class Sample(NamedTuple):
             self.corners_known[part],
             self.geometry,
         )
+
+
+def contents(folder: str | Path) -> dict[str, str]:
+    """What the samples in the folders of a folder hold, whenever they were written: a hash by SET/NAME.npz."""
+    found = {}
+    for path in sorted(Path(folder).glob("*/[!.]*.npz")):
+        with zipfile.ZipFile(path) as arrays:
+            parts = [[part.filename, part.CRC] for part in arrays.infolist()]
+        found[path.relative_to(folder).as_posix()] = fingerprint.of_values(parts)
+    return found

@@ -20,7 +20,7 @@ import numpy as np
 
 from kibs_steps import fingerprint, photographs, store
 from kibs_steps.learn import augmentation, dataset
-from kibs_steps.learn.samples import Sample
+from kibs_steps.learn.samples import CORRECTED, Sample
 from kibs_steps.models import runtime
 from kibs_steps.simulate import citymodel, draped
 
@@ -31,6 +31,7 @@ SHARE_ALIKE = "CC BY-SA 4.0: trained on SpaceNet-2 images under that licence"
 SIMULATED = "MIT, as the code: trained on simulated scenes only"
 AND = "; and "  # between the terms of a licence
 OWN = "as the owner of the training data decides"
+CITIES = "as the owners of the city models decide that its simulated scenes show"
 TALL_EVERY = 3  # one simulated tile in so many shows tall buildings
 DIRECTIONS = tuple(runtime.TOLD)  # that networks are told, where they are known
 HELD_OUT = 900_000  # seeds of simulated validation tiles begin here
@@ -175,12 +176,20 @@ def signature(args: argparse.Namespace) -> str:
     records = [store.read_json(Path(folder) / "own.json") for folder in args.own]
     view, sun = _direction(args.view_azimuth, args.view_elevation), _direction(args.sun_azimuth, args.sun_elevation)
     init = fingerprint.of_source(args.init, Path(args.out) / "fingerprints.json") if args.init else None
-    cities = sorted(Path(city).name for city in args.cities)
+    cities = city_files(args)
+    corrected = [store.read_json(path) for folder in args.own if (path := Path(folder) / CORRECTED).is_file()]
     look = fingerprint.of_file(args.look, Path(args.out) / "fingerprints.json") if args.look else None
     alike = [look, sorted(args.untold)] if args.look or args.untold else []
+    alike += [corrected] if corrected else []
     return fingerprint.of_values(
         records, bool(args.data), args.free, sorted(args.leave_out), cities, view, sun, init, *alike
     )
+
+
+def city_files(args: argparse.Namespace) -> list[str]:
+    """What the city models hold that simulated tiles show."""
+    cache = Path(args.out) / "fingerprints.json"
+    return sorted(fingerprint.of_file(city, cache) for city in args.cities)
 
 
 def as_seen(sample: Sample, number: int, shown: Sequence[np.ndarray], untold: Sequence[str]) -> Sample:
@@ -220,7 +229,8 @@ def about(
     bound = SHARE_ALIKE if args.free else NON_COMMERCIAL
     licence = bound if graphs or chips else OWN if args.own else SIMULATED
     teachers = [record["licence"] for record in records if "licence" in record]
-    found: dict[str, Any] = {"data": data, "licence": together(licence, *teachers)}
+    cities = [CITIES] if args.cities else []
+    found: dict[str, Any] = {"data": data, "licence": together(licence, *teachers, *cities)}
     for name, direction in (("view", view), ("sun", sun)):
         # Simulated tiles show all directions unless one is asked for; own ones alone show theirs.
         shown = [direction] if simulates else [tuple(r[name]) if r[name] else None for r in records]
@@ -301,14 +311,16 @@ def _claim(pool: Path, args: argparse.Namespace, view: Any, sun: Any) -> None:
         "view": view and list(view),
         "sun": sun and list(sun),
         "cities": sorted(Path(city).name for city in args.cities),
+        "city_files": city_files(args),
+        "leave_out": sorted(args.leave_out),
         "photographs": bool(args.data),
         "free": bool(args.free),
     }
     record = pool / "pool.json"
-    if record.is_file() and store.read_json(record) != shown:
+    before = store.read_json(record) if record.is_file() else shown
+    if {**shown, **before} != shown:  # older pools say less
         raise photographs.NoTrainingData(
-            f"{pool} holds tiles of other settings ({store.read_json(record)}, not {shown}): delete it, or choose another --pool "
-            "(train.name)"
+            f"{pool} holds tiles of other settings ({before}, not {shown}): delete it, or choose another --pool (train.name)"
         )
     pool.mkdir(parents=True, exist_ok=True)
     store.write_json(record, shown, summed=False)

@@ -243,7 +243,7 @@ def train(
     while used < seconds and (steps is None or step < steps) and (not judged or best.since < patience):
         batch = moved(next(batches), where)
         for group in optimiser.param_groups:
-            group["lr"] = learning_rate(used / seconds, settings.rate)
+            group["lr"] = learning_rate(max(used / seconds, step / steps if steps else 0.0), settings.rate)
         terms = terms_of(model, batch)
         optimiser.zero_grad()
         sum(terms.values()).backward()
@@ -316,6 +316,7 @@ def main(argv: list[str] | None = None) -> None:
         if (size := args.size or SIZE) * zoom % 32:
             parser.error(f"--size {size}: times the zoom, {zoom:g}, it must be a multiple of 32")
         settings = Settings(args.seed, size, args.batch or 8, rate, task=task, zoom=zoom, gsd=args.gsd)
+    torch.manual_seed(settings.seed)
     model = network(settings.task, settings.family, settings.zoom)
     if args.init:
         start_from(model, args.init)

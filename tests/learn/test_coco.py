@@ -122,6 +122,24 @@ def test_files_of_other_makers(tmp_path):
     assert not len(found.corners)
 
 
+def test_of_several_categories_those_of_roofs_count(tmp_path):
+    coco.write(tmp_path, [("a", sample())], coco.paper_bins())
+    content = json.loads((tmp_path / "sections.json").read_text())
+    square = {"image_id": 1, "bbox": [3, 3, 10, 6], "iscrowd": 0}
+    shapes = {1: [[3, 3, 13, 3, 13, 9, 3, 9]], 2: [[20, 20, 30, 20, 30, 30, 20, 30]]}
+    content["annotations"] = [{**square, "id": k, "category_id": k, "segmentation": s} for k, s in shapes.items()]
+    for names, right in ((("Roof section", "tree"), True), (("house", "tree"), False)):
+        content["categories"] = [{"id": k, "name": name} for k, name in enumerate(names, start=1)]
+        (tmp_path / "sections.json").write_text(json.dumps(content))
+        if right:
+            ((_, found),) = coco.read(tmp_path)
+            assert found.roof[5, 8] == 1
+            assert not found.roof[22:28, 22:28].any()
+        else:
+            with pytest.raises(coco.BadAnnotations, match=r"categories house, tree: call that of roof sections"):
+                list(coco.read(tmp_path))
+
+
 def test_squares_that_were_moved_or_classed_anew_by_hand_count_as_they_are(tmp_path):
     """The tool kept the exact corner and height of before in its fields."""
     coco.write(tmp_path, [("a", sample())], coco.paper_bins())

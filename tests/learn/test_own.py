@@ -12,11 +12,11 @@ import toy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kibs_steps import view
+from kibs_steps import truth, view
 from kibs_steps.georeference import convergence
 from kibs_steps.grid import Grid, Window
 from kibs_steps.learn import own
-from kibs_steps.learn.samples import UNKNOWN, Sample
+from kibs_steps.learn.samples import UNKNOWN, Sample, contents
 from kibs_steps.scene import Direction
 from kibs_steps.simulate import scene as simulation
 
@@ -102,6 +102,76 @@ def test_whatever_samples_follow_from_is_recorded(city, tmp_path):
         records.append(prepare(city, tmp_path / "own", *options)[1])
     records.append(prepare(city, tmp_path / "own", *options, "--bands=3,2,1")[1])
     assert len({json.dumps(record) for record in records}) == 4
+
+
+def part_of(folder, path, shape):
+    """An area of the simulated raster, px, as a layer."""
+    with rasterio.open(folder / "scene.tif") as source:
+        placed = shapely.transform(shape, lambda xy: np.column_stack(source.transform * tuple(xy.T)))
+        geopandas.GeoDataFrame(geometry=[placed], crs=source.crs).to_file(path)
+    return f"--annotated={path}"
+
+
+def test_tiles_of_which_nothing_is_known_are_of_no_set(city, tmp_path):
+    """On them a network has no loss, and training would end as soon as it looked at them."""
+    folder, _ = city
+    drawn = part_of(folder, tmp_path / "part.gpkg", shapely.box(0, 0, SIZE, 100))
+    for split in ("shuffle", "blocks"):
+        options = [f"--truth={folder}/truth.gpkg", drawn, f"--split={split}", "--square=1", "--buffer=0"]
+        samples, record = prepare(city, tmp_path / split, *options)
+        assert set(samples) <= {"r000c000", "r000c001", "r000c002"}
+        assert sum(record["split"]["tiles"].values()) == 3
+        assert record["split"]["tiles"]["training"] > 0
+        assert all((sample.roof != UNKNOWN).any() for _, sample in samples.values())
+
+
+def test_of_a_roof_cut_by_what_is_known_neither_rim_nor_middle_are_taught(city, tmp_path):
+    folder, rendering = city
+    (row, col) = np.argwhere(rendering.section > 0)[len(np.argwhere(rendering.section > 0)) // 2].tolist()
+    section = rendering.section[row, col]
+    drawn = part_of(folder, tmp_path / "half.gpkg", shapely.box(0, 0, col + 0.5, SIZE))
+    samples, _ = prepare(city, tmp_path / "own", f"--truth={folder}/truth.gpkg", drawn, "--split=shuffle")
+    cut = 0
+    for name, (_, sample) in samples.items():
+        window = window_of(name)
+        true = rendering.section[window.row : window.row + TILE, window.col : window.col + TILE]
+        mine = (true == section) & (sample.roof != UNKNOWN)
+        cut += int((mine & (sample.roof == 1)).sum())
+        assert (sample.labels[mine & (sample.roof == 1)] <= 0).all()
+        assert np.isfinite(sample.height[mine & (sample.roof == 1)]).all()
+        known = (sample.labels > 0) & (true > 0)
+        assert (sample.roof[known] == 1).all()
+    assert cut > 0
+
+
+@pytest.mark.parametrize("what", ["buildings", "annotated"])
+def test_outlines_that_lie_elsewhere_are_refused(city, tmp_path, what):
+    folder, _ = city
+    part_of(folder, tmp_path / "far.gpkg", shapely.box(9e4, 0, 9e4 + 50, 50))
+    options = [f"--{what}={tmp_path / 'far.gpkg'}"] + ([f"--truth={folder}/truth.gpkg"] if what == "annotated" else [])
+    with pytest.raises(truth.NoOverlap, match=r"far.gpkg: no polygon lies in .*scene.tif: check"):
+        prepare(city, tmp_path / "own", *options)
+
+
+def test_samples_corrected_by_hand_are_learned_from_and_not_made_anew(city, tmp_path):
+    pytest.importorskip("pycocotools", reason="COCO needs the extra `learn` (pycocotools)")
+    from kibs_steps.learn import coco
+
+    folder, _ = city
+    options = [f"--truth={folder}/truth.gpkg", "--split=shuffle"]
+    prepare(city, tmp_path / "own", *options)
+    before = contents(tmp_path / "own")
+    prepare(city, tmp_path / "own", *options)
+    assert contents(tmp_path / "own") == before  # whenever they were written
+    words = ["--samples", str(tmp_path / "own/training"), "--coco", str(tmp_path / "coco")]
+    coco.main(words)
+    sections = json.loads((tmp_path / "coco/sections.json").read_text())
+    sections["annotations"] = sections["annotations"][1:]
+    (tmp_path / "coco/sections.json").write_text(json.dumps(sections))
+    coco.main([*words, "--to", "samples"])
+    assert json.loads((tmp_path / "own/corrected.json").read_text()) == contents(tmp_path / "own") != before
+    with pytest.raises(own.NothingToLearn, match="corrected by hand"):
+        prepare(city, tmp_path / "own", *options)
 
 
 def test_another_split_leaves_no_tile_of_the_one_before(city, tmp_path):

@@ -78,6 +78,11 @@ def test_thresholds_are_those_of_the_model_for_sections(tmp_path):
     assert recipe.recipe({}, tmp_path).export == {"both": [], "sections": [], "corners": []}
 
 
+def test_a_prominence_that_is_asked_for_is_that_of_joins_too(tmp_path):
+    given = {"train": {"thresholds": {"prominence": 0.3}, "joins": 7}}
+    assert recipe.recipe(given, tmp_path).joins["sections"] == ["--scenes=7", "--prominence=0.3"]
+
+
 def test_free_sources_are_asked_for(tmp_path):
     assert "--free" in recipe.recipe({"train": {"data": "kibs", "free": True}}, tmp_path).training["both"]
     assert "--free" not in recipe.recipe({"train": {"data": "kibs"}}, tmp_path).training["both"]

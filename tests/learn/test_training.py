@@ -48,6 +48,24 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
     assert training.train(model, tiles, SETTINGS, tmp_path, first["seconds"], workers=0) == 3  # budget used up
 
 
+def test_a_seed_makes_the_same_network(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(training.sources, "gather", lambda *_: training.sources.Sources(None, [], {}))
+    monkeypatch.setattr(training, "train", lambda model, *_, **__: made.append(model) or 0)
+    monkeypatch.setattr(training.examples, "Examples", lambda *_: None)
+    for seed in (0, 0, 1):
+        training.main([f"--out={tmp_path / str(len(made))}", f"--seed={seed}", "--tiles=0"])
+    first, same, other = (model.state_dict()["maps.0.weight"] for model in made)
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
+
+
+def test_a_run_of_so_many_steps_ends_at_the_lowest_rate(tmp_path):
+    training.train(training.network(), Tiles(), SETTINGS, tmp_path, 6000, steps=8, workers=0)
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert state["optimiser"]["param_groups"][0]["lr"] < 0.1 * SETTINGS.rate
+
+
 def test_another_run_is_not_overwritten(tmp_path):
     tiles = Tiles()
     training.train(training.network(), tiles, SETTINGS, tmp_path, 600, steps=1, workers=0)

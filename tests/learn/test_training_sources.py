@@ -109,6 +109,8 @@ def test_a_pool_of_other_settings_is_refused(tmp_path):
         claimed("--view-azimuth=320", "--view-elevation=65")
     with pytest.raises(photographs.NoTrainingData):
         claimed("--view-azimuth=140", "--view-elevation=50", "--gsd=0.25")
+    with pytest.raises(photographs.NoTrainingData):  # its tiles may show the ground of that place
+        claimed("--view-azimuth=140", "--view-elevation=50", "--leave-out", "inria")
 
 
 def test_data_and_weights_make_a_run(tmp_path):
@@ -120,8 +122,22 @@ def test_data_and_weights_make_a_run(tmp_path):
     plain = signature()
     assert plain == signature("--shares=simulated=1")  # how often, not what
     kinds = [plain, signature("--free"), signature(f"--init={tmp_path / 'w.pt'}"), signature("--own", str(town))]
+    city = tmp_path / "a.city.json"
+    for text in ("one", "other"):  # by what they hold, not by their names
+        city.write_text(text)
+        kinds.append(signature("--cities", str(city)))
+    assert len(set(kinds)) == len(kinds)
     own(tmp_path / "town", count=11)
-    assert len({*kinds, signature("--own", str(town))}) == 5
+    changed = signature("--own", str(town))
+    (town / "corrected.json").write_text("{}")
+    assert len({*kinds, changed, signature("--own", str(town))}) == len(kinds) + 2
+
+
+def test_the_licence_names_the_owners_of_city_models():
+    args = arguments("--cities", "a.city.json")
+    assert sources.about(args, True, False, False, None, None)["licence"] == sources.CITIES
+    both = sources.about(args, True, True, False, None, None)["licence"]
+    assert both == f"{sources.NON_COMMERCIAL}; and {sources.CITIES}"
 
 
 def test_corner_heights_of_several_data_sets_are_pooled(tmp_path):

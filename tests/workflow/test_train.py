@@ -131,3 +131,15 @@ def test_training_killed_without_warning_goes_on_from_its_last_checkpoint(tmp_pa
         int(n) for n in re.findall(r"^step (\d+) ", (tmp_path / "runs/town/logs/training_both.log").read_text(), re.M)
     ]
     assert said == [n for n in range(50, 251, 50) if n > kept]
+
+
+def test_what_is_wrong_with_training_stops_no_other_run(tmp_path):
+    simulation.main(["--size=70", f"--out={tmp_path / 'a'}", "--seed=3", "--style=suburb"])
+    scene = {"raster": "a/scene.tif", "dtm": "a/dtm.tif", **ANGLES}
+    train = {"name": "town", "init": "nowhere", "tiles": 5}
+    (tmp_path / "config.yaml").write_text(json.dumps({"scenes": {"known": scene}, "train": train}))
+    built = run(tmp_path, "-n", "--config", "scene=known")
+    assert built.returncode == 0, built.stdout + built.stderr
+    refused = run(tmp_path, "-n", "train")
+    assert refused.returncode
+    assert "train.init: nowhere" in refused.stdout + refused.stderr

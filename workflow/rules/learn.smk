@@ -1,11 +1,32 @@
 # Training; needs the extra `learn` (torch). Checkpoints lie in runs/ and are no rule's output, which Snakemake would delete:
 # the same command goes on after a kill.
 
+from kibs_steps.errors import KibsError
 from kibs_steps.learn import recipe as recipes
+from kibs_steps.learn.samples import CORRECTED
 
-RECIPE = cli.or_exit(
-    recipes.recipe, config, Path(workflow.basedir), workflow.config_settings.config
-)
+
+def trains():
+    """Whether something is asked for that the recipe says how to make."""
+    return any(
+        word == "train" or word.startswith(("runs/", "models/"))
+        for word in sys.argv[1:]
+    )
+
+
+def planned_recipe():
+    """The recipe; what is wrong in it stops no other run."""
+    try:
+        return recipes.recipe(
+            config, Path(workflow.basedir), workflow.config_settings.config
+        )
+    except KibsError:
+        if trains():
+            raise
+        return recipes.recipe({}, Path(workflow.basedir))
+
+
+RECIPE = cli.or_exit(planned_recipe)
 TRAIN = {**recipes.DEFAULTS, **(config.get("train") or {})}
 
 
@@ -57,6 +78,12 @@ rule trained:
         own=[f"runs/{RECIPE.name}/own/{own}/own.json" for own in RECIPE.own],
         look=[f"runs/{RECIPE.name}/look/{scene}.npy" for scene in RECIPE.look],
         init=lambda w: RECIPE.starts[w.network],
+        cities=RECIPE.cities,
+        corrected=[
+            file
+            for own in RECIPE.own
+            if Path(file := f"runs/{RECIPE.name}/own/{own}/{CORRECTED}").exists()
+        ],
     output:
         "runs/{name}/{network}/done.json",
     log:
@@ -81,6 +108,7 @@ rule exported:
         done=lambda w: f"runs/{w.name}/{RECIPE.network_of[w.task]}/done.json",
         look=[f"runs/{RECIPE.name}/look/{scene}.npy" for scene in RECIPE.look],
         like=lambda w: RECIPE.like[w.task],
+        cities=RECIPE.cities,
     output:
         "models/{name}/{task}.onnx",
     log:
