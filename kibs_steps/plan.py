@@ -42,6 +42,7 @@ DEFAULTS = {
     "suppose": False,
 }
 SIMULATED = {"size": 1200, "gsd": 0.38, "style": "mixed", "relief": 0.0, "slope": 0.0, "crs": "EPSG:32631"}
+AS_SIMULATED = {"truth_frame": "map", "truth_z": "absolute", "projection_height": None, "bands": None}
 NAMED = ("truth", "sections", "regions", "footprints", "dsm", "aoi", "metadata")  # settings that are files
 TASKS = {"two_stage": ("sections", "corners"), "single": ("both",)}
 PAPER_MODE = {"planes": "paper"}  # besides the stride and the rule at seams
@@ -158,8 +159,14 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     folder = results / name
     simulated = settings.get("simulate")
     if simulated is not None:
-        simulated = {**SIMULATED, **simulated}
-        settings = {**settings, "simulate": simulated}
+        for key in ("raster", "dtm", "truth"):
+            if settings.get(key) is not None:
+                raise BadConfig(
+                    f"scene {name} is simulated and makes its own {key}: leave out {key}, or name another scene (scene=NAME)"
+                )
+        usual = {k: v for k, v in SIMULATED.items() if k != "crs" or not simulated.get("city")}  # a city has its own
+        simulated = {**usual, **simulated}
+        settings = {**settings, "simulate": simulated, **AS_SIMULATED}
         if settings.get("aoi"):
             raise BadConfig(f"scene {name}: a simulated scene is as large as simulate.size says: leave out aoi")
         for key in ("view_azimuth", "view_elevation", "sun_azimuth", "sun_elevation"):

@@ -41,7 +41,8 @@ def make(files, **settings):
         **toy.VIEW,
         **settings,
     }
-    ((name, full),) = plan.scenes(config, SCHEMA).items()
+    given = {key: value for key, value in config.items() if value is not None}
+    ((name, full),) = plan.scenes(given, SCHEMA).items()
     return plan.plan(name, full, folder, folder / "results")
 
 
@@ -176,8 +177,18 @@ def test_bad_configuration(files, settings, message):
 
 
 def test_a_simulated_scene_has_no_aoi(files):
+    simulated = {"simulate": {"seed": 1}, "sun_azimuth": 150.0, "sun_elevation": 45.0, "raster": None, "dtm": None}
     with pytest.raises(BadConfig, match="leave out aoi"):
-        make(files, simulate={"seed": 1}, aoi="a.gpkg", sun_azimuth=150.0, sun_elevation=45.0)
+        make(files, **simulated, aoi="a.gpkg")
+    for key in ("raster", "dtm", "truth"):
+        with pytest.raises(BadConfig, match=f"makes its own {key}: leave out {key}, or name another scene"):
+            make(files, **{**simulated, key: "a"})
+    # Its truth stands on the map in absolute heights, whatever others' does.
+    usual, told = (
+        make(files, **simulated, **more) for more in ({}, {"truth_z": "above_ground", "projection_height": 0})
+    )
+    assert told.settings == usual.settings
+    assert told.signature == usual.signature
 
 
 def test_simulated_scene_needs_angles(files):

@@ -1,8 +1,8 @@
 """Real cities: LOD2 buildings of a CityJSON file (0.8 to 2.0) or a CityJSONSeq, as faces the simulator can render.
 
-A **building** is a top-level city object with all its parts. Of each object the geometry of the highest LOD counts, LOD 2 at
-least. Its roof surfaces are roof sections; neighbouring ones in one plane are one section. Surfaces without semantics are
-told apart by their normals.
+A **building** is a top-level city object with all its parts. Of each object the geometry of the highest LOD below 3 counts, LOD 2
+at least; where there is none, one of LOD 3. Its roof surfaces, terraces too, are roof sections; neighbouring ones in one
+plane are one section. Surfaces without semantics are told apart by their normals.
 
 In: a file. Out: a `CityModel`, map metres of the file's own CRS, absolute z. Raises `UnusableCity`.
 """
@@ -55,14 +55,14 @@ def read(path: str | Path) -> CityModel:
     """The buildings of a CityJSON file or CityJSONSeq with LOD2 geometry. Raises `UnusableCity`."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UnusableCity(f"{path} cannot be read: give a CityJSON file (.json) or a CityJSONSeq (.jsonl)") from error
     try:
         documents = [json.loads(text)]
     except json.JSONDecodeError:
         try:
-            documents = [json.loads(line) for line in text.splitlines() if line.strip()]
+            documents = [json.loads(line) for line in text.split("\n") if line.strip()]
         except json.JSONDecodeError as error:
             raise UnusableCity(f"{path} is not JSON (line {error.lineno}): give CityJSON or CityJSONSeq") from error
     if not documents or not isinstance(documents[0], dict) or documents[0].get("type") != "CityJSON":
@@ -70,29 +70,40 @@ def read(path: str | Path) -> CityModel:
     header = documents[0]
     buildings: list[Building] = []
     ground: list[np.ndarray] = []
-    for document in documents:
-        # A feature has vertices of its own; where they lie stands in the header.
-        corners = _vertices(document.get("vertices") or [], header.get("transform"))
-        objects = document.get("CityObjects") or {}
-        buildings += _buildings(objects, corners)
-        for item in objects.values():
-            if item["type"] == "TINRelief":
-                used = [np.ravel(_flat(g["boundaries"])) for g in item.get("geometry") or []]
-                ground += [corners[np.unique(np.concatenate(used).astype(int))]] if used else []
+    try:
+        for document in documents:
+            # A feature has vertices of its own; where they lie stands in the header.
+            corners = _vertices(document.get("vertices") or [], header.get("transform"))
+            objects = document.get("CityObjects") or {}
+            buildings += _buildings(objects, corners)
+            for item in objects.values():
+                if item.get("type") == "TINRelief":
+                    used = [i for g in item.get("geometry") or [] for i in _flat(g["boundaries"])]
+                    ground += [corners[np.unique(np.array(used, int))]]
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UnusableCity(f"{path} is not sound CityJSON ({error!r}): check it with cjval, and mend it") from error
     if not buildings:
         raise UnusableCity(f"{path} has no building with LOD2 roofs: LOD1 blocks show the simulator no roof sections")
     system = (header.get("metadata") or {}).get("referenceSystem")
-    return CityModel(path.name, _horizontal(system), buildings, np.concatenate(ground) if ground else None)
+    points = np.concatenate([*ground, np.zeros((0, 3))])
+    return CityModel(path.name, _horizontal(system), buildings, points if _spans(points) else None)
 
 
-def _horizontal(system: str | None) -> str | None:
-    """The horizontal part of a reference system, "EPSG:n"; None where none is stated. Raises `UnusableCity` for degrees."""
+def _spans(points: np.ndarray) -> bool:
+    """Whether points (n, 3) span an area in plan, as those of a terrain do."""
+    return len(points) >= 3 and np.linalg.matrix_rank(points[1:, :2] - points[0, :2], tol=1e-6) == 2
+
+
+def _horizontal(system: str | int | None) -> str | None:
+    """The horizontal part of a reference system, "EPSG:n"; None where none is stated. Raises `UnusableCity` for degrees and for
+    systems of others than EPSG."""
+    system = str(system or "")
     # The URL or URN of one system, or of several: then the horizontal one comes first.
-    codes = re.findall(r"EPSG(?::[^:,]*:|/[^/]*/|:)(\d+)", system or "", re.IGNORECASE) or re.findall(
-        r"(\d+)/?$", system or ""
-    )
-    if not codes:
+    codes = re.findall(r"EPSG(?::[^:,]*:|/[^/]*/|:)(\d+)", system, re.IGNORECASE) or re.findall(r"(\d+)/?$", system)
+    if not system:
         return None
+    if not codes:
+        raise UnusableCity(f"the city's reference system {system} is not known: state one of EPSG's")
     import pyproj
 
     try:
@@ -126,24 +137,26 @@ def _surfaces(geometry: dict[str, Any]) -> Iterator[tuple[list[list[int]], str |
 
     def walk(boundaries: list, values: Any, depth: int) -> Iterator[tuple[list[list[int]], str | None]]:
         for i, part in enumerate(boundaries):
-            value = values[i] if isinstance(values, list) else values
+            value = (values[i] if i < len(values) else None) if isinstance(values, list) else values
             if depth:
                 yield from walk(part, value, depth - 1)
             else:
-                yield part, None if value is None else kinds[value]
+                yield part, kinds[value] if value is not None and 0 <= value < len(kinds) else None
 
     depths = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
     yield from walk(geometry["boundaries"], semantics.get("values"), depths[geometry["type"]])
 
 
 def _lod(geometry: dict[str, Any]) -> float:
-    solid = geometry["type"] in ("MultiSurface", "CompositeSurface", "Solid", "MultiSolid", "CompositeSolid")
-    return float(geometry.get("lod", 0)) if solid else 0.0
+    """The level of detail of surfaces, 0 where none is told."""
+    surfaces = geometry["type"] in ("MultiSurface", "CompositeSurface", "Solid", "MultiSolid", "CompositeSolid")
+    told = re.match(r"\d+(\.\d+)?", str(geometry.get("lod")))
+    return float(told[0]) if surfaces and told else 0.0
 
 
 def _buildings(objects: dict[str, Any], corners: np.ndarray) -> list[Building]:
     """The buildings among city objects, parts gathered under their top-level object, in the file's order."""
-    whole = {name: o for name, o in objects.items() if o["type"].startswith("Building")}  # groups of buildings are none
+    whole = {name: o for name, o in objects.items() if o.get("type", "").startswith("Building")}  # groups are none
     above = {c: name for name, o in whole.items() for c in [*o.get("children", ()), *o.get("Parts", ())]}
     for name, item in whole.items():
         parent = item.get("parent") or next((p for p in item.get("parents", ()) if p in whole), None)
@@ -151,13 +164,18 @@ def _buildings(objects: dict[str, Any], corners: np.ndarray) -> list[Building]:
             above[name] = parent
     shells: dict[str, list[tuple[Polygon, str | None]]] = {}
     for name, item in objects.items():
-        chosen = max((g for g in item.get("geometry") or [] if 2 <= _lod(g) < 3), key=_lod, default=None)
-        if not item["type"].startswith("Building") or chosen is None:
+        if name not in whole:
+            continue
+        detailed = [g for g in item.get("geometry") or [] if _lod(g) >= 2]
+        chosen = max(detailed, key=lambda g: (_lod(g) < 3, _lod(g)), default=None)
+        if chosen is None:
             continue
         top = name
         while top in above:
             top = above[top]
         for rings, kind in _surfaces(chosen):
+            if not rings:
+                continue
             outer, *inner = (_clean(corners[ring]) for ring in rings)
             if len(outer) >= 3:
                 shells.setdefault(top, []).append((Polygon(outer, tuple(h for h in inner if len(h) >= 3)), kind))
@@ -172,15 +190,19 @@ def _clean(ring: np.ndarray) -> np.ndarray:
 
 
 def _building(name: str, shell: list[tuple[Polygon, str | None]]) -> Building:
-    normals = planes([face for face, _ in shell]).normal
+    plane = planes([face for face, _ in shell])
+    normals = plane.normal
+    if all(kind is None for _, kind in shell) and _inside_out(shell, plane.point, normals):
+        shell = [(_turned(face), None) for face, _ in shell]
+        normals = -normals
     roofs, walls = [], []
     for (face, kind), normal in zip(shell, normals, strict=True):
-        if kind in ("GroundSurface", "OuterFloorSurface") or not normal.any():
+        if kind == "GroundSurface" or not normal.any():
             continue
         if abs(normal[2]) < UPRIGHT:
             walls.append(face)
-        elif kind == "RoofSurface" or (kind is None and normal[2] > 0):
-            roofs.append(face if normal[2] > 0 else Polygon(face.ring[::-1], tuple(h[::-1] for h in face.holes)))
+        elif kind == "RoofSurface" or (kind in (None, "OuterFloorSurface") and normal[2] > 0):  # of these a terrace
+            roofs.append(face if normal[2] > 0 else _turned(face))
         elif kind is not None:
             walls.append(face)
     points = np.concatenate([face.ring for face, _ in shell])
@@ -188,6 +210,25 @@ def _building(name: str, shell: list[tuple[Polygon, str | None]]) -> Building:
     centre = (low[:2] + high[:2]) / 2
     reach = float(np.hypot(*(points[:, :2] - centre).T).max())
     return Building(name, sections(roofs), walls, float(low[2]), (float(centre[0]), float(centre[1])), reach)
+
+
+def _turned(face: Polygon) -> Polygon:
+    """The face seen from its other side."""
+    return Polygon(face.ring[::-1], tuple(hole[::-1] for hole in face.holes))
+
+
+def _inside_out(shell: list[tuple[Polygon, str | None]], points: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether surfaces with walls among them show their inner sides: what they enclose is less than nothing. Only of solids it is
+    said which way they turn."""
+    if not (normals.any(axis=1) & (np.abs(normals[:, 2]) < UPRIGHT)).any():
+        return False
+
+    def area(ring: np.ndarray) -> float:
+        return float(np.linalg.norm(np.cross(ring - ring[0], np.roll(ring, -1, axis=0) - ring[0]).sum(axis=0)) / 2)
+
+    areas = np.array([area(face.ring) - sum(map(area, face.holes)) for face, _ in shell])
+    middle = points.mean(axis=0)
+    return bool((((points - middle) * normals).sum(axis=1) * areas).sum() < 0)
 
 
 def sections(roofs: list[Polygon]) -> list[Polygon]:

@@ -32,6 +32,8 @@ STEEP, ABOVE = (
     0.2,
     80.0,
 )  # share of random views that are of this elevation (deg) and more: orthophotos, near-nadir images
+SMALLEST = 64  # px
+USUAL_CRS = "EPSG:32631"
 TALL_STYLES = ("centre", "perimeter")
 TALL_CITIES = 0.55  # of the tiles of tall buildings show real cities, if there are any
 TALL_GROWN = 0.8  # of those have grown
@@ -184,7 +186,7 @@ def simulate(
 
 def split_of(x_y: np.ndarray, seed: int) -> int:
     """Split of a building by the 100 m square it stands in: 0 training (60 %), 1 validation, 2 testing (20 % each)."""
-    square = np.floor(np.asarray(x_y) / 100.0).astype(int).tolist()
+    square = (np.floor(np.asarray(x_y) / 100.0).astype(np.int64) % 2**32).tolist()  # a seed is not negative
     return int(np.searchsorted([0.6, 0.8], np.random.default_rng([seed, *square]).random(), side="right"))
 
 
@@ -298,16 +300,19 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument(
         "--city", type=Path, help="a CityJSON or CityJSONSeq file to show, where it stands, on its own ground"
     )
-    parser.add_argument("--crs", default="EPSG:32631", help="a projected CRS in metres; a city file's own comes first")
+    parser.add_argument("--crs", help=f"a projected CRS in metres ({USUAL_CRS}); a city file's own comes first")
     parser.add_argument("--out", type=Path, required=True, help="folder to write to")
     args = parser.parse_args(argv)
-    if args.size < 1 or not args.gsd > 0:
-        raise UnusableScene("--size and --gsd must be positive")
+    if args.size < SMALLEST or not args.gsd > 0:
+        raise UnusableScene(f"--size must be {SMALLEST} px at least, --gsd positive")
     for name, least in (("view", 20), ("sun", 5)):
         if not least <= getattr(args, f"{name}_elevation") <= 90:
             raise UnusableScene(f"--{name}-elevation must be between {least} and 90 degrees")
     model = citymodel.read(args.city) if args.city else None
     crs = model.crs if model and model.crs else args.crs
+    if model and not model.crs and args.crs is None:
+        raise UnusableScene(f"{args.city} does not say its reference system: name it with --crs (simulate.crs)")
+    crs = crs or USUAL_CRS
     grid = Grid(crs, *_origin(crs, args.gsd, args.size, model), args.gsd, args.size, args.size)
     if not in_true_metres(pyproj.CRS(crs), np.array(grid.bounds).reshape(2, 2).mean(axis=0)):
         raise UnusableScene(f"{crs}: there its metre is not one on the ground; give a UTM zone, such as EPSG:32631")
@@ -318,6 +323,8 @@ def main(argv: list[str] | None = None) -> None:
     picture, terrain = simulate(
         args.seed, grid, view, sun, args.style, args.relief, args.slope / 100.0, model=model, look=look
     )
+    if not picture.sections:
+        raise UnusableScene("the scene shows no roof: give another --seed or --style, or a larger --size")
     step = terrain.step[0]
     _write_raster(args.out / "scene.tif", picture.rgb, crs, grid.x0, grid.y0, grid.gsd)
     _write_raster(

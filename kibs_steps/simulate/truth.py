@@ -5,6 +5,7 @@ In: a city's faces, the terrain, the view, the labels of what is seen. Out: a `S
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -44,9 +45,13 @@ def section_truths(
     rings = [ring for f in roofs for ring in (f.ring, *f.holes)]
     points = np.concatenate(rings)
     above = points[:, 2] - terrain(points[:, :2])
-    at = grid.to_image(geometry.image_position(points[:, :2], points[:, 2], k, terrain))
-    base = float(terrain.heights.flat[0]) if np.ptp(terrain.heights) == 0 else float(np.mean(terrain.heights))
-    whole = zbuffer.pixel_counts(roofs, k, sample_frame(grid), base)
+    placed = geometry.image_position(points[:, :2], points[:, 2], k, terrain)
+    at = grid.to_image(placed)
+    # Counted where the image shows them: on a slope it is squeezed or stretched.
+    flat = np.split(np.column_stack([placed, points[:, 2]]), np.cumsum([len(r) for r in rings])[:-1])
+    first = np.cumsum([0, *(1 + len(f.holes) for f in roofs)]).tolist()
+    drawn = [zbuffer.Polygon(flat[a], tuple(flat[a + 1 : b])) for a, b in pairwise(first)]
+    whole = zbuffer.pixel_counts(drawn, (0.0, 0.0), sample_frame(grid))
     shown = np.split(np.column_stack([at, above]), np.cumsum([len(r) for r in rings])[:-1])
     out, i = [], 0
     for face, size in zip(roofs, whole, strict=True):

@@ -65,6 +65,70 @@ def test_a_building_that_has_lod3_too_is_shown_by_its_lod2(tmp_path):
     assert len(citymodel.read(tmp_path / "c.json").buildings[0].roofs) == 2
 
 
+def test_a_building_of_lod3_alone_is_shown_by_that(tmp_path):
+    model = citymodel.read(cities.write(tmp_path / "c.json", [HOUSE], lod=3.0, shift=SHIFT))
+    assert len(model.buildings[0].roofs) == 2
+
+
+def test_a_terrace_is_a_roof(tmp_path):
+    """OuterFloorSurfaces look up, and are seen from above."""
+    document = cities.document([HOUSE], shift=SHIFT)
+    document["CityObjects"]["b0-0"]["geometry"][0]["semantics"]["surfaces"][0]["type"] = "OuterFloorSurface"
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    assert len(citymodel.read(tmp_path / "c.json").buildings[0].roofs) == 2
+
+
+def test_surfaces_that_show_their_inner_sides_are_turned(tmp_path):
+    """Of a MultiSurface nobody says which way it turns."""
+    turned = [(ring[::-1], kind) for ring, kind in HOUSE]
+    model = citymodel.read(cities.write(tmp_path / "c.json", [turned], solid=False, semantics=False, shift=SHIFT))
+    expected = sorted(tuple(map(float, p)) for ring, kind in HOUSE if kind == "RoofSurface" for p in ring)
+    assert corners(model.buildings[0].roofs) == expected
+    valley = [
+        ([[0, 0, 9], [5, 0, 6], [5, 8, 6], [0, 8, 9]], "RoofSurface"),
+        ([[5, 0, 6], [10, 0, 9], [10, 8, 9], [5, 8, 6]], "RoofSurface"),
+    ]
+    roofs = citymodel.read(cities.write(tmp_path / "v.json", [valley], solid=False, semantics=False)).buildings[0].roofs
+    assert len(roofs) == 2  # roofs alone enclose nothing
+
+
+@pytest.mark.parametrize(
+    "flaw", ["few semantics", "wild semantic", "no rings", "odd lod", "no type", "number", "flat terrain", "mark"]
+)
+def test_ordinary_flaws_are_survived(tmp_path, flaw):
+    document = cities.document([HOUSE], shift=SHIFT)
+    objects = document["CityObjects"]
+    geometry = objects["b0-0"]["geometry"][0]
+    if flaw == "few semantics":
+        geometry["semantics"]["values"][0].pop(0)
+        geometry["semantics"]["values"][0] = [None, *geometry["semantics"]["values"][0]][:6]
+    if flaw == "wild semantic":
+        geometry["semantics"]["values"][0][-1] = 9
+    if flaw == "no rings":
+        geometry["boundaries"][0].append([])
+    if flaw == "odd lod":
+        objects["bench"] = {
+            "type": "CityFurniture",
+            "geometry": [{"type": "MultiSurface", "lod": "2.2.1", "boundaries": []}],
+        }
+        objects["b0-0"]["geometry"].append({"type": "MultiSurface", "lod": None, "boundaries": []})
+    if flaw == "no type":
+        objects["thing"] = {"geometry": []}
+    if flaw == "number":
+        document["metadata"]["referenceSystem"] = 28992
+    if flaw == "flat terrain":
+        objects["ground"] = {
+            "type": "TINRelief",
+            "geometry": [{"type": "CompositeSurface", "lod": "1", "boundaries": [[[0, 1, 0]]]}],
+        }
+    text = json.dumps(document)
+    (tmp_path / "c.json").write_text("\ufeff" + text if flaw == "mark" else text, encoding="utf-8")
+    model = citymodel.read(tmp_path / "c.json")
+    assert len(model.buildings[0].roofs) == 2
+    assert model.crs == "EPSG:28992"
+    assert model.terrain is None
+
+
 def test_a_group_of_buildings_is_no_building(tmp_path):
     document = cities.document([HOUSE, cities.gable(84040.0, 446020.0, 5.5)], shift=SHIFT)
     tops = [name for name, item in document["CityObjects"].items() if item["type"] == "Building"]
@@ -160,6 +224,8 @@ def test_a_bent_surface_becomes_planar_ones():
         (json.dumps(cities.document([])), "LOD2"),
         (json.dumps(cities.document([HOUSE], crs=4979)), "degrees"),
         (json.dumps(cities.document([HOUSE], crs=999999)), "not known"),
+        (json.dumps({**cities.document([HOUSE]), "metadata": {"referenceSystem": "OGC:CRS84h"}}), "not known"),
+        (json.dumps({**cities.document([HOUSE]), "vertices": []}), "not sound CityJSON"),
     ],
 )
 def test_other_files_are_refused_by_name(tmp_path, text, say):

@@ -1,5 +1,6 @@
 """Simulated scenes against closed forms: lean, shadows, occlusion, labels, heights on slopes, same seed same bytes."""
 
+import cities
 import cv2
 import numpy as np
 import pytest
@@ -233,7 +234,32 @@ def test_program_writes_a_scene_twice_the_same(tmp_path):
         assert np.allclose(z, place[:, 2], atol=0.01)
 
 
+@pytest.mark.parametrize("slope", [-0.3, 0.0, 0.15, 0.3])
+@pytest.mark.parametrize("elevation", [45.0, 59.3])
+def test_a_roof_that_nothing_hides_is_wholly_visible_on_slopes_too(slope, elevation):
+    x = np.arange(-250, 310, 2.0)
+    rise = np.repeat((slope * (x - 30))[::-1][:, None], len(x), 1)
+    hill = dtm.Terrain(rise, x[0], x[-1], (2.0, 2.0))
+    picture = shoot(block(22, 26, 38, 36, 12.0, 1, base=-1.0), (180, elevation), terrain=hill)
+    (section,) = picture.sections
+    assert section.visible > 0.96
+
+
+@pytest.mark.parametrize("place", [(-10.0, 100.0), (-740_000.0, -1_040_000.0)])
+def test_squares_of_negative_coordinates_have_a_split(place):
+    x, y = np.meshgrid(place[0] + 100.0 * np.arange(40), place[1] + 100.0 * np.arange(40))
+    splits = [scene.split_of(at, 3) for at in np.column_stack([x.ravel(), y.ravel()])]
+    assert np.bincount(splits, minlength=3) / len(splits) == pytest.approx([0.6, 0.2, 0.2], abs=0.05)
+
+
 def test_unusable_requests_say_so(tmp_path):
+    with pytest.raises(scene.UnusableScene, match="shows no roof: give another --seed"):
+        scene.main(["--style", "farm", "--size", "64", "--out", str(tmp_path)])
+    with pytest.raises(scene.UnusableScene, match="size must be 64 px"):
+        scene.main(["--size", "1", "--out", str(tmp_path)])
+    nowhere = cities.write(tmp_path / "c.json", [cities.gable(4_468_000.0, 5_334_000.0)], crs=None)
+    with pytest.raises(scene.UnusableScene, match="does not say its reference system: name it with --crs"):
+        scene.main(["--city", str(nowhere), "--out", str(tmp_path)])
     with pytest.raises(scene.UnusableScene, match="projected in metres"):
         scene.main(["--crs", "EPSG:4326", "--out", str(tmp_path)])
     with pytest.raises(scene.UnusableScene, match="not one on the ground"):
