@@ -12,6 +12,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from kibs_steps.errors import KibsError
 from kibs_steps.plan import BadConfig, folder_of, layered
 
 DEFAULTS = {
@@ -180,6 +181,17 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
     joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
     joins = {task: shown if task in joining else [] for task in network_of}
     return Recipe(str(train["name"]), network_of, taken, own, look, training, export, joins, starts, like, cities)
+
+
+def of_run(config: dict[str, Any], base: Path, told: Collection[str], words: Collection[str]) -> Recipe:
+    """The recipe in a run that is asked for by the `words` of a command line: what is wrong in it stops those alone that want
+    what it makes. Raises `BadConfig` in these."""
+    try:
+        return recipe(config, base, told)
+    except KibsError:
+        if any(word == "train" or word.startswith(("runs/", "models/")) for word in words):
+            raise
+        return recipe({}, base)
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:

@@ -1,32 +1,16 @@
 # Training; needs the extra `learn` (torch). Checkpoints lie in runs/ and are no rule's output, which Snakemake would delete:
 # the same command goes on after a kill.
 
-from kibs_steps.errors import KibsError
 from kibs_steps.learn import recipe as recipes
 from kibs_steps.learn.samples import CORRECTED
 
-
-def trains():
-    """Whether something is asked for that the recipe says how to make."""
-    return any(
-        word == "train" or word.startswith(("runs/", "models/"))
-        for word in sys.argv[1:]
-    )
-
-
-def planned_recipe():
-    """The recipe; what is wrong in it stops no other run."""
-    try:
-        return recipes.recipe(
-            config, Path(workflow.basedir), workflow.config_settings.config
-        )
-    except KibsError:
-        if trains():
-            raise
-        return recipes.recipe({}, Path(workflow.basedir))
-
-
-RECIPE = cli.or_exit(planned_recipe)
+RECIPE = cli.or_exit(
+    recipes.of_run,
+    config,
+    Path(workflow.basedir),
+    workflow.config_settings.config,
+    sys.argv[1:],
+)
 TRAIN = {**recipes.DEFAULTS, **(config.get("train") or {})}
 
 
