@@ -90,15 +90,14 @@ def main(argv: list[str] | None = None) -> None:
     tiles = tiling.tiles(block, facts.grid.width, facts.grid.height)
     labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
     images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
-    core = tiling.block_core(block, facts.grid.width, facts.grid.height)
-    geometry = supposed.told(facts, core, args.supposed)
-    network = runtime.open_network(model, geometry, args.provider, args.threads, args.looks)
+    session = runtime.opened(model, args.provider, args.threads, args.looks)
+    networks = supposed.telling(facts, session, args.supposed)
     tables, heights = [CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile in tiles:
         place = tile.row, tile.col
         if not labels[place].any():
             continue  # no section is near that could take its corners
-        outputs = network(images[place])
+        outputs = networks(tile.core)(images[place])
         tables.append(of_tile(heads.decode_corners(outputs, model.contract), tile, tiling))
         heights.append(heights_of_tile(heads.height_map(outputs, model.contract), labels[place], tile, tiling))
     store.write_table(args.out, pa.concat_tables(tables))

@@ -55,7 +55,9 @@ def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         raise SectionsUnusable(UNREADABLE.format(path=path, error=error)) from error
     rows = len(frame)
     frame["row"] = np.arange(rows)
-    frame = frame[frame.geometry.notna()].explode(ignore_index=True)  # collections too, which editing may leave
+    frame = (
+        frame[frame.geometry.notna()].explode().explode(ignore_index=True)
+    )  # collections too, which editing may leave
     frame = frame[frame.geom_type == "Polygon"]
     if frame.empty:
         raise SectionsUnusable(EMPTY_LAYER.format(path=path))

@@ -258,7 +258,11 @@ def fit(
         if not trusted:
             reason = f"largest triangle of corners is {share:.0%} of the section; level at the model's mean height"
             return Fit(flat(ground + fallback[0], middle), fallback[1], "degenerate_triangle", reason)
-        plane = triangle_plane(corners, largest_triangle(corners.col, corners.row)[0], middle)
+        try:
+            plane = triangle_plane(corners, largest_triangle(corners.col, corners.row)[0], middle)
+        except np.linalg.LinAlgError:
+            reason = "its corners stand on one line; level at the model's mean height"
+            return Fit(flat(ground + fallback[0], middle), fallback[1], "degenerate_triangle", reason)
     elif not trusted:
         reason = f"corners span {share:.0%} of the section: level across the direction they do not span"
         return Fit(plane, sigma, "degenerate_triangle", reason)

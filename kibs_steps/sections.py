@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -21,9 +21,6 @@ from kibs_steps import cli, raster, scene, store, supposed
 from kibs_steps.grid import Block, Grid, Tile, Tiling, Window
 from kibs_steps.labels import rims
 from kibs_steps.models import scoring
-
-if TYPE_CHECKING:
-    from kibs_steps.models import runtime
 
 MIN_STRIP_IOU = 0.3  # two views of one section share most of the strip; a neighbour's rim shares a pixel line
 SIDES = ("north", "south", "west", "east")
@@ -129,17 +126,19 @@ def detect(
     tiling: Tiling,
     block: Block,
     grid: Grid,
-    network: runtime.Network,
+    networks: supposed.Networks,
     contract: dict,
 ) -> list[View]:
-    """Run the 2D model on every tile of a block image (core grown by the margin; rgb uint8, valid bool).
+    """Run the 2D model on every tile of a block image (core grown by the margin; rgb uint8, valid bool), told where it is.
 
     Tiles without data are not run. Labels are numbered through the block, tile after tile.
     """
     views, used = [], 0
     for tile, image, data in tile_images(rgb, valid, tiling, block, grid):
         seen = core_of(data, tile, tiling.margin).any()
-        views.append(view_of(tile, image, network(image) if seen else None, contract, tiling.margin, data, used))
+        views.append(
+            view_of(tile, image, networks(tile.core)(image) if seen else None, contract, tiling.margin, data, used)
+        )
         used += len(views[-1].scores)
     return views
 
@@ -213,22 +212,21 @@ PIECES = pa.schema(
 )
 
 
-def pieces(views: list[View], clear: np.ndarray, tiling: Tiling, core: Window) -> pa.Table:
-    """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it is void, which is in or
-    beside pixels that are not `clear` (no data, burnt out).
+def pieces(views: list[View], unclear: np.ndarray, tiling: Tiling, core: Window) -> pa.Table:
+    """One row per piece: its outline along pixel edges (WKB, image coordinates), areas in px, whether it is void, which is where
+    the block is `unclear`.
 
     `split` and `owner` are for truth that is fed instead of detections: 2 (none) and 0 here. `evidence` as in `View`.
     """
     rows = []
     p = tiling.margin
-    beside = grown(~clear)  # of the whole block: what is missing may begin at a tile's seam
     for view in views:
         inside = core_of(view.labels, view.tile, p)
         outlines = pixel_outlines(inside, view.tile.core)
         full = np.bincount(view.labels.ravel(), minlength=1)
         own = np.bincount(inside.ravel(), minlength=len(full))
         place = window_in_block(view.tile.core, core, p)
-        blank = beside[place.row : place.row + place.height, place.col : place.col + place.width]
+        blank = unclear[place.row : place.row + place.height, place.col : place.col + place.width]
         near_blank = set(np.unique(inside[blank]).tolist())
         for label in np.unique(view.labels[view.labels > 0]).tolist():
             outline, number = outlines.get(label), label - view.used - 1
@@ -248,6 +246,22 @@ def pieces(views: list[View], clear: np.ndarray, tiling: Tiling, core: Window) -
                 }
             )
     return pa.Table.from_pylist(rows, schema=PIECES)
+
+
+def unclear(
+    rgb: np.ndarray, valid: np.ndarray, views: list[View], tiling: Tiling, core: Window, grid: Grid
+) -> np.ndarray:
+    """Where sections of a block (its `core` with margins) cannot be trusted, bool (h, w): in and beside pixels without data, but
+    for those beyond the raster, and in tiles that are burnt out."""
+    p = tiling.margin
+    block = core.grown(p)
+    inside = block.within(grid)
+    missing = np.zeros_like(valid)
+    part = np.s_[inside.row - block.row : inside.row - block.row + inside.height,
+                 inside.col - block.col : inside.col - block.col + inside.width]  # fmt: skip
+    missing[part] = ~valid[part]
+    # A burnt tile answers for itself: of one in the next block nothing is known here.
+    return grown(missing) | burnt_out(rgb, valid, views, tiling, core)
 
 
 def burnt_out(rgb: np.ndarray, valid: np.ndarray, views: list[View], tiling: Tiling, core: Window) -> np.ndarray:
@@ -306,12 +320,12 @@ def unstack(image: np.ndarray, tiles: list[Tile], side: int) -> dict[tuple[int, 
 
 
 def write(
-    views: list[View], clear: np.ndarray, tiling: Tiling, core: Window, rule: str, out: argparse.Namespace
+    views: list[View], unclear: np.ndarray, tiling: Tiling, core: Window, rule: str, out: argparse.Namespace
 ) -> None:
     """Write what the tiles of a block see to the files `out` names: labels, pieces, links, seams."""
     links = inner_links(views, tiling.margin, rule)
     raster.write(out.labels, stack({(v.tile.row, v.tile.col): v.labels.astype(np.uint32) for v in views}, tiling.tile))
-    store.write_table(out.pieces, pieces(views, clear, tiling, core))
+    store.write_table(out.pieces, pieces(views, unclear, tiling, core))
     store.write_table(out.links, pa.table({"first": links[:, 0], "second": links[:, 1]}))
     store.write_arrays(out.seams, seams(views, tiling.margin))
 
@@ -342,11 +356,10 @@ def main(argv: list[str] | None = None) -> None:
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
-    geometry = supposed.told(facts, core, args.supposed)
-    network = runtime.open_network(model, geometry, args.provider, args.threads, args.looks)
-    views = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
-    clear = valid & ~burnt_out(rgb, valid, views, tiling, core)
-    write(views, clear, tiling, core, args.seam_rule, args)
+    session = runtime.opened(model, args.provider, args.threads, args.looks)
+    networks = supposed.telling(facts, session, args.supposed)
+    views = detect(rgb, valid, tiling, block, facts.grid, networks, model.contract)
+    write(views, unclear(rgb, valid, views, tiling, core, facts.grid), tiling, core, args.seam_rule, args)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def detect(
     tiling: Tiling,
     block: Block,
     grid: Grid,
-    network: runtime.Network,
+    networks: supposed.Networks,
     contract: dict,
 ) -> tuple[list[sections.View], pa.Table, pa.Table]:
     """What every tile of a block image (core grown by the margin; rgb uint8, valid bool) sees, all its corners and heights."""
@@ -33,7 +33,7 @@ def detect(
     for tile, image, data in sections.tile_images(rgb, valid, tiling, block, grid):
         outputs = None
         if sections.core_of(data, tile, tiling.margin).any():
-            outputs = network(image)
+            outputs = networks(tile.core)(image)
             tables.append(corners.of_tile(heads.decode_corners(outputs, contract), tile, tiling))
         views.append(sections.view_of(tile, image, outputs, contract, tiling.margin, data, used))
         if outputs is not None:
@@ -71,11 +71,11 @@ def main(argv: list[str] | None = None) -> None:
     core = tiling.block_core(block, facts.grid.width, facts.grid.height)
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
-    geometry = supposed.told(facts, core, args.supposed)
-    network = runtime.open_network(model, geometry, args.provider, args.threads, args.looks)
-    views, table, heights = detect(rgb, valid, tiling, block, facts.grid, network, model.contract)
-    clear = valid & ~sections.burnt_out(rgb, valid, views, tiling, core)
-    sections.write(views, clear, tiling, core, args.seam_rule, args)
+    session = runtime.opened(model, args.provider, args.threads, args.looks)
+    networks = supposed.telling(facts, session, args.supposed)
+    views, table, heights = detect(rgb, valid, tiling, block, facts.grid, networks, model.contract)
+    unclear = sections.unclear(rgb, valid, views, tiling, core, facts.grid)
+    sections.write(views, unclear, tiling, core, args.seam_rule, args)
     store.write_table(args.corners, table)
     store.write_table(args.heights, heights)
 

@@ -124,8 +124,9 @@ def confirmed(core_area: np.ndarray, full_area: np.ndarray, links: np.ndarray) -
     return (core_area > 0) & (linked | (2 * core_area >= full_area))
 
 
-def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
-    """Which pieces of all blocks are one section. Reads numbers and seams only, seams of two rows of blocks at a time."""
+def joined(blocks: list[Block], found: Detections, rule: str, stride: int) -> Joined:
+    """Which pieces of all blocks are one section. Reads numbers and seams only, seams of two rows of blocks at a time; a seam is
+    one of tiles, each `stride` px long, as it is inside blocks."""
     tables = {b.name: found.pieces(b, NUMBERS) for b in blocks}
     column = {name: np.concatenate([t[name].to_numpy() for t in tables.values()]) for name in NUMBERS}
     # Pieces are numbered by tile, whatever block a tile belongs to, so that sums over them do not depend on blocks.
@@ -155,7 +156,10 @@ def joined(blocks: list[Block], found: Detections, rule: str) -> Joined:
         ):
             if place in at and seams[other_side].size:
                 neighbour, theirs = at[place]
-                pairs = links_across(theirs[side], seams[other_side], side, rule)
+                along = 0 if side == "east" else 1
+                cuts = np.arange(stride, seams[other_side].shape[along], stride)
+                strips = (np.split(strip, cuts, axis=along) for strip in (theirs[side], seams[other_side]))
+                pairs = np.concatenate([links_across(*two, side, rule) for two in zip(*strips, strict=True)])
                 links.append(np.stack([numbered(neighbour, pairs[:, 0]), numbered(block, pairs[:, 1])], axis=1))
         at.pop((block.row - 1, block.col), None)
         at[block.row, block.col] = block, seams
@@ -325,7 +329,7 @@ def sweep(
     thresholds: dict[str, float] | None,
 ) -> Iterator[tuple[int, pa.Table]]:
     """The sections of each row of blocks (table after `SECTIONS`, by id), row after row."""
-    whole = joined(blocks, found, rule)
+    whole = joined(blocks, found, rule, tiling.stride)
     last = whole.last_row()
     rows = sorted({b.row for b in blocks})
     side = tiling.stride * tiling.block

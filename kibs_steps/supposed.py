@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from kibs_steps import cli, georeference, scene, store
 from kibs_steps import view as geometry
 from kibs_steps.grid import Grid, Tile, Tiling, Window
 from kibs_steps.scene import Direction, Scene
+
+if TYPE_CHECKING:
+    from kibs_steps.models import runtime
 
 NADIR = Direction(0.0, 90.0, (0.0, 0.0))
 AZIMUTHS = tuple(range(0, 360, 45))  # deg
@@ -50,6 +53,10 @@ class Supposed(NamedTuple):
 
     view: Direction | None
     sun: Direction | None
+
+
+NOTHING = Supposed(None, None)
+Networks = Callable[[Window], "runtime.Network"]  # a tile's core -> the network that looks at it
 
 
 def directions(look: Look, view: Direction | None, sun: Direction | None, turned: float = 0.0) -> Supposed:
@@ -97,15 +104,19 @@ def looked_over(tiling: Tiling, grid: Grid) -> list[Tile]:
     return [tiles[k] for k in chosen]
 
 
-def told(facts: Scene, core: Window, path: str | None = None) -> np.ndarray:
-    """What networks are told of view and sun in a block's `core` (1, 6): what the scene knows, else what is supposed there."""
+def told(facts: Scene, core: Window, supposed: Supposed = NOTHING) -> np.ndarray:
+    """What networks are told of view and sun in the middle of a tile's `core` (1, 6): what the scene knows there, else what is
+    supposed."""
     from kibs_steps.models import runtime
 
-    view, sun = facts.view_of(core), facts.sun
-    if path:
-        supposed = read(path)
-        view, sun = view or supposed.view, sun or supposed.sun
+    view, sun = facts.view_of(core) or supposed.view, facts.sun or supposed.sun
     return runtime.geometry_vector(view and view.lean, sun and sun.lean, facts.grid.gsd)
+
+
+def telling(facts: Scene, session: Callable[[np.ndarray], runtime.Network], path: str | None) -> Networks:
+    """From a tile's core to the network that looks at it: a session of a model, told what is known there."""
+    supposed = read(path) if path else NOTHING
+    return lambda core: session(told(facts, core, supposed))
 
 
 def read(path: str) -> Supposed:

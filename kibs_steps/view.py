@@ -16,6 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+ROUNDS = 120  # steps until places settle: a quarter of them whole ones, then halves, quarters and eighths
+SETTLED = 1e-6  # m
+
 Surface = Callable[[np.ndarray], np.ndarray]  # (n, 2) map metres -> (n,) heights in metres
 Lean = tuple[float, float] | np.ndarray  # one (2,) for all points, or one for each (n, 2); m per m, grid axes
 
@@ -64,33 +67,40 @@ def ground_position(
     """Where points seen at `image` (n, 2 map metres) with `height` (n, m above the ground under them) really are.
 
     Iterates P_{j+1} = P_img + (h + T(P_j) − T0(P_img))·k, T0 being the surface the image was projected on (the terrain
-    itself unless given); converges while |slope|·|k| < 1. Returns positions (n, 2) and absolute heights (n,).
+    itself unless given); converges while |slope|·|k| < 1, and by shorter steps where the ground falls away more steeply. Returns
+    positions (n, 2) and absolute heights (n,).
     """
     image = np.asarray(image, float)
     k = np.asarray(k, float)
     base = (projected_on or terrain)(image)
-    position = image + np.asarray(height, float)[..., None] * k
-    for _ in range(60):
-        moved = image + (height + terrain(position) - base)[..., None] * k
-        done = np.abs(moved - position).max(initial=0.0) < 1e-6
-        position = moved
-        if done:
-            break
+    start = image + np.asarray(height, float)[..., None] * k
+    position = _settled(start, lambda at: image + (height + terrain(at) - base)[..., None] * k)
     return position, terrain(position) + height
+
+
+def _settled(position: np.ndarray, step: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Where points (n, 2) come to rest by steps from place to place (m), each by itself, whatever others do.
+
+    Those that swing about their place are taken there by shorter and shorter steps.
+    """
+    moving = np.ones(position.shape[:-1], bool)
+    for number in range(ROUNDS):
+        moved = step(position)
+        if number >= ROUNDS // 4:
+            moved = position + 0.5 ** (4 * number // ROUNDS) * (moved - position)
+        still = np.abs(moved - position).max(axis=-1, initial=0.0) < SETTLED
+        position = np.where(moving[..., None], moved, position)
+        moving = moving & ~still
+        if not moving.any():
+            break
+    return position
 
 
 def image_position(ground: np.ndarray, z: np.ndarray, k: Lean, projected_on: Surface) -> np.ndarray:
     """Where the image shows points standing at `ground` (n, 2) with absolute height `z` (n,): the inverse of the above."""
     ground = np.asarray(ground, float)
     k = np.asarray(k, float)
-    position = ground.copy()
-    for _ in range(60):
-        moved = ground - (z - projected_on(position))[..., None] * k
-        done = np.abs(moved - position).max(initial=0.0) < 1e-6
-        position = moved
-        if done:
-            break
-    return position
+    return _settled(ground, lambda at: ground - (z - projected_on(at))[..., None] * k)
 
 
 def ray_meets_plane(image: np.ndarray, plane: Plane, k: Lean, projected_on: Surface) -> tuple[np.ndarray, np.ndarray]:

@@ -145,7 +145,8 @@ def test_rows_that_editing_left_odd_are_kept_or_told(tmp_path, capsys):
         )
 
     line = shapely.Polygon([(590_010, 5_749_990), (590_020, 5_749_990), (590_030, 5_749_990)])
-    mixed = shapely.GeometryCollection([box(10, 10), shapely.Point(590_000, 5_749_990)])
+    inner = shapely.MultiPolygon([box(10, 10)])
+    mixed = shapely.GeometryCollection([inner, shapely.Point(590_000, 5_749_990)])
     table = {"section_id": ["10000", "new", "7"]}
     geopandas.GeoDataFrame(table, geometry=[mixed, box(50, 50), line], crs=grid.crs).to_file(tmp_path / "a.gpkg")
     ids, outlines = edited.read(tmp_path / "a.gpkg", grid)

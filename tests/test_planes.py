@@ -95,6 +95,16 @@ def test_few_corners_give_level_planes(n, status):
     assert found.plane.c == pytest.approx(expected)
 
 
+def test_paper_rule_levels_corners_that_stand_on_one_line():
+    """A triangle where it is seen, a line where it stands."""
+    seen = np.array([[0.0, 0.0], [20.0, 0.0], [0.0, 20.0]])
+    x, z, same = np.array([0.0, 5.0, 10.0]), np.array([4.0, 6.0, 9.0]), np.full(3, 0.5)
+    corners = planes.Points(seen[:, 0], seen[:, 1], x, np.zeros(3), z, z, same)
+    found = planes.fit(corners, 400.0, np.zeros(2), 0.0, (6.11, 3.0), "paper")
+    assert found.status == "degenerate_triangle"
+    assert (found.plane.a, found.plane.b, found.plane.c) == (0.0, 0.0, 6.11)
+
+
 def test_paper_rule_distrusts_thin_and_huge_triangles():
     xyz = np.array([[0, 0, 5.0], [10, 0, 5.0], [5, 0.2, 9.0]])
     for area in (50.0, 0.1):

@@ -10,6 +10,7 @@ from kibs_steps.models import scoring
 
 SIDE, MARGIN = 64, 8
 TILING = Tiling(SIDE, MARGIN, 2)
+GRID = Grid("EPSG:32631", 0.0, 0.0, 0.38, 96, 96)
 
 
 def block(share: float, white: int = 255):
@@ -29,19 +30,48 @@ def block(share: float, white: int = 255):
 @pytest.mark.parametrize(("share", "white", "flagged"), [(0.9, 255, 1), (0.4, 255, 0), (0.9, 230, 0)])
 def test_sections_of_a_burnt_out_tile_are_void(share, white, flagged):
     rgb, valid, views, core = block(share, white)
-    clear = valid & ~sections.burnt_out(rgb, valid, views, TILING, core)
-    table = sections.pieces(views, clear, TILING, core)
+    unclear = sections.unclear(rgb, valid, views, TILING, core, GRID)
+    table = sections.pieces(views, unclear, TILING, core)
     assert len(table) == 4
     assert table["void"].to_pylist() == [bool(flagged), False, False, False]
     assert all(shapely.from_wkb(wkb).area == 100 for wkb in table["outline"].to_pylist())
 
 
 def test_a_section_beside_missing_data_that_begins_at_the_tiles_seam_is_void():
-    _, valid, views, core = block(0.0)
+    rgb, valid, views, core = block(0.0)
     views[0].labels[20:30, SIDE - MARGIN - 10 : SIDE - MARGIN] = 1  # reaches the seam to the tile at its right
     valid[MARGIN : MARGIN + 48, MARGIN + 48 :] = False  # which has no data
-    table = sections.pieces(views, valid, TILING, core)
+    table = sections.pieces(views, sections.unclear(rgb, valid, views, TILING, core, GRID), TILING, core)
     assert table["void"].to_pylist() == [True, True, False, False]
+
+
+def test_a_section_at_the_rasters_edge_is_not_void():
+    """Beyond the raster nothing is missing: `edge` says that a roof goes on there."""
+    rgb, valid, views, core = block(0.0)
+    views[0].labels[20:30, MARGIN : MARGIN + 10] = 1
+    valid[:MARGIN], valid[-MARGIN:], valid[:, :MARGIN], valid[:, -MARGIN:] = (False,) * 4
+    table = sections.pieces(views, sections.unclear(rgb, valid, views, TILING, core, GRID), TILING, core)
+    assert not any(table["void"].to_pylist())
+
+
+@pytest.mark.parametrize("side", [1, 2])
+def test_a_burnt_tile_answers_for_itself_whatever_the_blocks(side):
+    """A roof that reaches its seam from the next tile, which is clear."""
+    tiling, found = Tiling(SIDE, MARGIN, side), {}
+    whole = np.full((96 + 2 * MARGIN, 96 + 2 * MARGIN, 3), 120, np.uint8)
+    whole[MARGIN : MARGIN + 48, MARGIN + 48 : MARGIN + 96] = 255
+    for place in tiling.blocks(96, 96):
+        core = tiling.block_core(place, 96, 96)
+        rgb = whole[core.row : core.row + core.height + 2 * MARGIN, core.col : core.col + core.width + 2 * MARGIN]
+        views = []
+        for number, tile in enumerate(tiling.tiles(place, 96, 96)):
+            labels = np.zeros((SIDE, SIDE), np.int32)
+            labels[20:30, SIDE - MARGIN - 10 : SIDE - MARGIN] = number + 1
+            views.append(sections.View(tile, labels, np.array([0.9]), scoring.none(1), number))
+        unclear = sections.unclear(rgb, np.ones(rgb.shape[:2], bool), views, tiling, core, GRID)
+        for row in sections.pieces(views, unclear, tiling, core).to_pylist():
+            found[row["tile_row"], row["tile_col"]] = row["void"]
+    assert found == {(0, 0): False, (0, 1): True, (1, 0): False, (1, 1): False}
 
 
 @pytest.mark.parametrize("size", [(96, 96), (100, 51), (50, 49), (7, 143)])

@@ -42,8 +42,10 @@ def detections(image, block_side, nets, shuffle=None, tolerance=0.0, scorer=None
         grown = core.grown(toy.MARGIN)  # the padded image starts a margin before the raster
         window = (slice(core.row, core.row + grown.height), slice(core.col, core.col + grown.width))
         network, terms = nets["sections"]
-        views = sections.detect(padded[window], inside[window], tiling, block, grid, network, terms)
-        pieces[block] = sections.pieces(views, inside[window], tiling, core)
+        views = sections.detect(
+            padded[window], inside[window], tiling, block, grid, lambda _, told=network: told, terms
+        )
+        pieces[block] = sections.pieces(views, sections.grown(~inside[window]), tiling, core)
         inner = sections.inner_links(views, toy.MARGIN)
         links[block] = pa.table({"first": inner[:, 0], "second": inner[:, 1]})
         seams[block] = sections.seams(views, toy.MARGIN)
@@ -61,6 +63,46 @@ def detections(image, block_side, nets, shuffle=None, tolerance=0.0, scorer=None
     )
     _, each, near = zip(*stitch.stitch(blocks, read, grid, tiling, tolerance, 3.0, scorer=scorer), strict=True)
     return pa.concat_tables(each).sort_by("section_id"), pa.concat_tables(near)
+
+
+@pytest.mark.parametrize(
+    "rows", [(17, 20), (19, 21), (19, 32)], ids=["beside the tiles' corner", "across it", "from it on"]
+)
+@pytest.mark.parametrize("bent", [False, True])
+@pytest.mark.parametrize("rule", ["overlap", "touch"])
+def test_a_seam_of_blocks_is_one_of_tiles(rows, bent, rule):
+    """A roof across the corner of four tiles of 20 px: as many sections whether blocks are one or two tiles wide."""
+    size, margin = 80, 2
+    grid = Grid("EPSG:32631", 0.0, 0.0, toy.GSD, size, size)
+    truth = np.zeros((size + 2 * margin,) * 2, np.int32)
+    truth[margin + rows[0] : margin + rows[1], margin + 30 : margin + 50] = 1
+    if bent:
+        truth[margin + 20 :, margin + 40 :] = 0
+    counts = []
+    for side in (1, 2):
+        tiling, files = Tiling(20 + 2 * margin, margin, side), {}
+        blocks = tiling.blocks(size, size)
+        for block in blocks:
+            views, used = [], 0
+            for tile in tiling.tiles(block, size, size):
+                part = truth[tile.core.row : tile.core.row + tiling.tile, tile.core.col : tile.core.col + tiling.tile]
+                seen = int(part.any())
+                views.append(sections.View(tile, part * (used + 1), np.ones(seen), scoring.none(seen), used))
+                used += seen
+            core = tiling.block_core(block, size, size)
+            nowhere = np.zeros((core.height + 2 * margin, core.width + 2 * margin), bool)
+            inner = sections.inner_links(views, margin, rule)
+            links = pa.table({"first": inner[:, 0], "second": inner[:, 1]})
+            files[block] = sections.pieces(views, nowhere, tiling, core), links, sections.seams(views, margin)
+        read = stitch.Detections(
+            lambda b, columns, files=files: files[b][0].select(columns),
+            lambda b, files=files: files[b][1],
+            lambda b, files=files: files[b][2],
+            lambda b: corners.CORNERS.empty_table(),
+            lambda b: heightmap.HEIGHTS.empty_table(),
+        )
+        counts.append(sum(len(table) for _, table, _ in stitch.stitch(blocks, read, grid, tiling, 0.0, 5.0, rule)))
+    assert counts[0] == counts[1] > 0
 
 
 def test_every_painted_section_comes_back_once(world):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import shapely
 
-from kibs_steps import supposed
+from kibs_steps import supposed, view
 from kibs_steps.grid import Grid, Tiling
-from kibs_steps.scene import Direction
+from kibs_steps.scene import Direction, Region, Scene
 
 
 def apart(one: Direction, other: Direction) -> float:
@@ -66,3 +67,23 @@ def test_tiles_looked_over_are_spread_over_the_raster():
     assert len({(t.row, t.col) for t in tiles}) == len(tiles)
     few = supposed.looked_over(tiling, Grid("EPSG:32631", 0.0, 0.0, 0.4, 100, 60))
     assert [(t.row, t.col) for t in few] == [(0, 0), (0, 1)]
+
+
+def test_networks_are_told_the_view_of_the_region_a_tile_lies_in(tmp_path):
+    """Blocks are larger than regions may be."""
+    grid = Grid("EPSG:32631", 500_000.0, 5_400_000.0, 0.38, 1792, 1792)
+    left, bottom, right, top = grid.bounds
+    border = left + 500 * grid.gsd
+    parts = (shapely.box(left, bottom, border, top), shapely.box(border, bottom, right, top))
+    directions = [Direction(a, 60.0, view.lean(a, 60.0)) for a in (90.0, 270.0)]
+    regions = tuple(Region(part, seen) for part, seen in zip(parts, directions, strict=True))
+    facts = Scene("a", "a.tif", (1, 2, 3), None, grid, None, None, None, tmp_path, regions=regions)
+    networks = supposed.telling(facts, lambda told: lambda rgb: told, None)
+    for side in (1, 4):
+        tiling = Tiling(512, 32, side)
+        for block in tiling.blocks(grid.width, grid.height):
+            for tile in tiling.tiles(block, grid.width, grid.height):
+                told = networks(tile.core)(None)
+                mine = directions[tile.core.col + tile.core.width / 2 > 500]
+                assert told[0, 0] == pytest.approx(-mine.lean[0] / grid.gsd)
+                assert told[0, 4] == 1

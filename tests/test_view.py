@@ -23,6 +23,33 @@ def points(seed=0, n=200):
     return random.uniform(-200, 200, (n, 2)), random.uniform(0, 30, n)
 
 
+def test_a_point_settles_whatever_points_are_beside_it():
+    """The bytes of a block must not depend on what else lies in it."""
+    image, height = points(n=600)
+    k = view.lean(140.0, 50.0)
+    place, z = view.ground_position(image, height, sloped, k)
+    seen = view.image_position(place, z, k, sloped)
+    for some in np.array_split(np.arange(600), 40):
+        own, own_z = view.ground_position(image[some], height[some], sloped, k)
+        assert (own == place[some]).all()
+        assert (own_z == z[some]).all()
+        assert (view.image_position(place[some], z[some], k, sloped) == seen[some]).all()
+
+
+@pytest.mark.parametrize("steepness", [0.9, 1.5, 4.0])
+def test_a_point_over_a_quay_finds_its_place(steepness):
+    """The ground falls towards the satellite more steeply than the view: there is one place all the same."""
+
+    def quay(x_y):
+        return 10.0 - np.clip(steepness * (np.asarray(x_y, float)[..., 1] + 3.0), 0.0, 8.0)
+
+    image = np.column_stack([np.zeros(81), np.linspace(-20, 20, 81)])
+    k = np.array(view.lean(0.0, 45.0))
+    place, z = view.ground_position(image, np.full(81, 6.0), quay, k)
+    assert place == pytest.approx(image + (z - quay(image))[:, None] * k, abs=1e-4)
+    assert z == pytest.approx(quay(place) + 6.0)
+
+
 class TestLean:
     @pytest.mark.parametrize(
         ("azimuth", "elevation", "length"),
