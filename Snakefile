@@ -70,7 +70,7 @@ rule detect:
 rule evaluate:
     """Compare every scene that has truth with it."""
     input:
-        [f"results/{p.name}/evaluation.json" for p in PLANS.values() if p.truth],
+        evaluated,
 
 
 rule simulate:

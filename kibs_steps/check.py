@@ -115,7 +115,8 @@ def page(plan: Plan, results: Path, todo: Mapping[str, int]) -> str:
     settings = plan.settings
     if settings.get("simulate") is not None:
         side = int(settings["simulate"]["size"])
-        width, height, gsd, crs = side, side, settings["simulate"]["gsd"], settings["simulate"]["crs"]
+        width, height, gsd = side, side, settings["simulate"]["gsd"]
+        crs = settings["simulate"].get("crs", "the city's CRS")
         image = f"simulated, seed {settings['simulate']['seed']}"
     else:
         grid = georeference.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))

@@ -43,6 +43,22 @@ def layer_of(path: str | Path) -> str | None:
     return LAYER if LAYER in [str(name) for name, _ in pyogrio.list_layers(path)] else None
 
 
+def _say_which(path: str | Path) -> None:
+    """Warn of other layers that look like edited sections: of a file with `LAYER` that one is read."""
+    import pyogrio
+
+    names = [str(name) for name, kind in pyogrio.list_layers(path) if kind and "Polygon" in str(kind)]
+    if LAYER not in names:
+        return
+    known = {LAYER, "roof_sections", "buildings", "footprints", "blocks"}
+    others = [n for n in names if n not in known and "section_id" in pyogrio.read_info(path, layer=n)["fields"]]
+    if others:
+        print(
+            f"warning: sections {path}: layer {LAYER} is read, not {', '.join(others)}: give a file of its own if that is meant",
+            file=sys.stderr,
+        )
+
+
 def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Ids (n,), 0 where there is none, and outlines (n,) in image coordinates (px). Raises `SectionsUnusable`."""
     import geopandas
@@ -50,6 +66,7 @@ def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     import pyogrio
 
     try:
+        _say_which(path)
         frame = geopandas.read_file(path, layer=layer_of(path))
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
         raise SectionsUnusable(UNREADABLE.format(path=path, error=error)) from error

@@ -129,6 +129,7 @@ def scenes(config: dict[str, Any], schema: dict[str, Any], told: Collection[str]
 
     A scene's own keys stand above those for all scenes, and keys `told` on the command line above both.
     """
+    config = user_settings.plain(config, schema)
     user_settings.check(config, schema)
     common = {k: v for k, v in config.items() if k not in RUN_KEYS}
     listed = {str(name): own for name, own in (config.get("scenes") or {}).items()}

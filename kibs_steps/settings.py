@@ -39,6 +39,27 @@ def read(path: str | Path) -> dict[str, Any]:
     return content
 
 
+def plain(config: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """A configuration whose `true` and `false` are what they mean: Snakemake leaves them text in `--config`, but for True and
+    False."""
+    switches = {k for k, of in schema["$defs"]["scene"]["properties"].items() if of.get("type") == "boolean"}
+    said = {"true": True, "false": False}
+    return {k: said.get(str(v).lower(), v) if k in switches and isinstance(v, str) else v for k, v in config.items()}
+
+
+def check_name(config: dict[str, Any], words: Iterable[str]) -> None:
+    """Raise `BadConfig` for a scene whose name on the command line (`words`) Snakemake took for a number that is written in
+    another way."""
+    name = config.get("scene")
+    if isinstance(name, bool) or not isinstance(name, (int, float)):
+        return
+    said = [word.removeprefix("scene=") for word in words if word.startswith("scene=")]
+    if said and str(name) not in said:
+        raise BadConfig(
+            f"scene={said[-1]}: Snakemake reads it as the number {name}: begin the scene's name with a letter"
+        )
+
+
 def check(config: dict[str, Any], schema: dict[str, Any]) -> None:
     """Raise `BadConfig` for the first unknown key or wrong value, naming its place and what is allowed there."""
     import jsonschema

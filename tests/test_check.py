@@ -64,3 +64,15 @@ def test_estimates_grow_with_what_is_to_do():
     assert check.duration(12.0) == "20 s"
     assert check.duration(1234.0) == "21 min"
     assert check.duration(40_000.0) == "11.1 h"
+
+
+def test_a_page_of_a_simulated_city(tmp_path, monkeypatch):
+    """Its CRS is in the city file."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "city.json").write_text("{}")
+    config = {k: v for k, v in cases.good(tmp_path).items() if k not in ("raster", "dtm", "truth")}
+    config |= {"simulate": {"seed": 1, "size": 128, "city": "city.json"}, "sun_azimuth": 150.0, "sun_elevation": 45.0}
+    ((name, values),) = plan.scenes(config, SCHEMA).items()
+    planned = plan.plan(name, values, tmp_path, tmp_path / "results")
+    text = check.page(planned, tmp_path / "results", dict.fromkeys(STEPS, len(planned.blocks)))
+    assert "128 x 128 px of 0.38 m in the city's CRS" in text

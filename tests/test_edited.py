@@ -135,6 +135,16 @@ def test_a_bowtie_becomes_its_larger_part(world):
     assert grid.width == toy_city.WIDTH
 
 
+def test_a_copy_beside_the_original_layer_is_told(tmp_path, capsys):
+    grid = Grid("EPSG:32631", 590_000.0, 5_750_000.0, 0.5, 320, 240)
+    square = shapely.box(590_010, 5_749_980, 590_020, 5_749_990)
+    frame = geopandas.GeoDataFrame({"section_id": [1]}, geometry=[square], crs=grid.crs)
+    for layer in (edited.LAYER, "my_edits"):
+        frame.to_file(tmp_path / "a.gpkg", layer=layer)
+    edited.read(tmp_path / "a.gpkg", grid)
+    assert f"layer {edited.LAYER} is read, not my_edits" in capsys.readouterr().err
+
+
 def test_rows_that_editing_left_odd_are_kept_or_told(tmp_path, capsys):
     """A polygon within a collection is a section, a new one may have a word for its id, what has no area is told."""
     grid = Grid("EPSG:32631", 590_000.0, 5_750_000.0, 0.5, 320, 240)

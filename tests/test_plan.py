@@ -12,7 +12,7 @@ import shapely
 import toy
 import yaml
 
-from kibs_steps import fingerprint, plan
+from kibs_steps import fingerprint, plan, settings
 from kibs_steps.models import contract
 from kibs_steps.plan import BadConfig
 
@@ -356,3 +356,21 @@ def test_a_set_is_found_by_name_where_the_workflow_lies_and_where_it_runs(tmp_pa
     assert plan.folder_of("research", base) == base / "models/research"
     assert plan.folder_of("mine", base).resolve() == here / "models/mine"
     assert plan.folder_of("elsewhere/set", base) == Path("elsewhere/set")
+
+
+def test_switches_may_be_written_as_in_yaml(files):
+    """Snakemake leaves `drape=true` on a command line text."""
+    assert make(files, drape="true", allow_angles="FALSE").settings["drape"] is True
+    assert make(files, allow_angles="FALSE").settings["allow_angles"] is False
+    with pytest.raises(BadConfig, match="drape: 'yes' is no boolean"):
+        make(files, drape="yes")
+
+
+@pytest.mark.parametrize(("said", "read"), [("2024_01", 202401), ("007", 7), ("2e3", 2000.0)])
+def test_names_that_snakemake_takes_for_numbers_are_refused(said, read):
+    words = ["--cores", "1", "--config", f"scene={said}"]
+    with pytest.raises(BadConfig, match=f"scene={said}: Snakemake reads it as the number"):
+        settings.check_name({"scene": read}, words)
+    settings.check_name({"scene": 7}, ["--config", "scene=7"])
+    settings.check_name({"scene": 7}, [])  # of a file
+    settings.check_name({"scene": said}, words)

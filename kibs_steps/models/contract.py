@@ -215,7 +215,8 @@ def check_angles(model: Model, view: dict | None, sun: dict | None, allow: bool 
                 f"({allowed[0]:g}-{allowed[1]:g}°)"
             )
             if off > REFUSE_BEYOND and not allow:
-                raise AngleOutsideTraining(f"{text}: choose another model, or set `allow_angles: true`")
+                less = ", leave out sun_azimuth and sun_elevation" if name == "sun" else ""
+                raise AngleOutsideTraining(f"{text}: choose another model{less}, or set `allow_angles: true`")
             if off > WARN_BEYOND:
                 warnings.append(text)
     return warnings

@@ -36,13 +36,18 @@ def sets(folder: Path, tasks: tuple[str, ...]) -> list[Set]:
         wanted = " and ".join(f"{task}.onnx" for task in tasks)
         raise contracts.NotAModel(
             f"no model at {folder}: give `models=` a folder with {wanted}"
-            + (", or set `method=single`: a both.onnx is there" if len(tasks) > 1 and _holds_both(folder) else "")
+            + (", or set `method=single`: a both.onnx is there" if len(tasks) > 1 and _holds(folder, "both") else "")
+            + (
+                ", or set `method=two_stage`: that is what is there"
+                if len(tasks) == 1 and _holds(folder, "corners")
+                else ""
+            )
         )
     return found
 
 
-def _holds_both(folder: Path) -> bool:
-    return any(folder.glob("both*.onnx")) or any(folder.glob("[!.]*/both*.onnx"))
+def _holds(folder: Path, task: str) -> bool:
+    return any(folder.glob(f"{task}*.onnx")) or any(folder.glob(f"[!.]*/{task}*.onnx"))
 
 
 def choose(found: list[Set], gsd: float | None, view: dict[str, float] | None, sun: dict[str, float] | None) -> Set:

@@ -22,9 +22,9 @@ from kibs_steps.publish.glb import origin_of
 
 def write(out: TextIO, found: Iterable[Mesh], origin: np.ndarray, crs: str, materials: str, licence: str = "") -> None:
     """Write buildings; `origin` (3,) map m."""
+    out.write(f"# origin {origin[0]:.0f} {origin[1]:.0f} {origin[2]:.0f} in {crs.splitlines()[0]}, metres, z up\n")
     if licence:
         out.write(f"# licence {licence}\n")
-    out.write(f"# origin {origin[0]:.0f} {origin[1]:.0f} {origin[2]:.0f} in {crs.splitlines()[0]}, metres, z up\n")
     out.write(f"mtllib {materials}\n")
     used = 0
     for mesh in found:

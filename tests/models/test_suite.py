@@ -123,3 +123,9 @@ def test_a_set_that_disagrees_with_itself_is_refused(tmp_path):
     toy.corners_model(tmp_path / "corners.onnx", toy.contract("corners", gsd=0.5))
     with pytest.raises(contract.ContractMismatch, match="disagree"):
         suite.sets(tmp_path, PAIR)
+
+
+def test_who_asks_for_one_model_where_a_pair_is_is_told(tmp_path):
+    toy.models(tmp_path)
+    with pytest.raises(contract.NotAModel, match="method=two_stage"):
+        suite.sets(tmp_path, ("both",))

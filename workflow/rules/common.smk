@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+from snakemake.exceptions import WorkflowError
 from snakemake.io import IOFile
 
 from kibs_steps import cli, failures, inputs as user_inputs, plan as plans, settings
@@ -20,6 +21,7 @@ TEMPORARY = ["blended.tif", "tiled.tif"]  # files that Snakemake deletes after u
 def planned():
     """The plan of every scene to build, its inputs checked."""
     user_inputs.writable(RESULTS)
+    settings.check_name(config, sys.argv[1:])
     schema = settings.read(
         Path(workflow.basedir, "workflow/schemas/config.schema.yaml")
     )
@@ -290,3 +292,11 @@ def report_failures(jobs, stopped):
     if not nested:
         text = failures.told(found, published, PLANS, RESULTS)
         atexit.register(print, text, file=sys.stderr, flush=True)
+
+
+def evaluated(wildcards):
+    """The comparisons of all scenes that have truth; without any there is nothing to compare."""
+    found = [f"results/{p.name}/evaluation.json" for p in PLANS.values() if p.truth]
+    if not found:
+        raise WorkflowError("evaluate: no scene has truth: give truth=FILE")
+    return found
