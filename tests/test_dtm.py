@@ -204,3 +204,13 @@ class TestDtm:
         with rasterio.open(tmp_path / "out/dtm.tif") as written:
             assert np.isfinite(written.read(1)).all()
             assert written.read(1).min() > -50
+
+
+def test_heights_by_scale_and_offset(tmp_path):
+    """Decimetres counted from 1000 m below the datum."""
+    case = TestDtm()
+    values = np.rint((case.heights() + 1000) * 10).astype("int16")
+    path = rasters.dtm(tmp_path / "dtm.tif", values, case.LEFT, case.TOP)
+    with rasterio.open(path, "r+") as target:
+        target.scales, target.offsets = (0.1,), (-1000.0,)
+    case.check(case.scene(tmp_path, path)[0], 0.06)

@@ -338,3 +338,62 @@ def test_slope_errors_do_not_depend_on_the_view(tmp_path):
         assert figures["planes"]["all"]["sections"] == 2
         assert figures["planes"]["all"]["normal_mae"] < 1e-4
         assert abs(scene.lean[1]) == pytest.approx(abs(view.lean(*direction)[1]))
+
+
+def test_relative_figures_by_hand():
+    """2 and 4 m found as 3 and 4; the baseline answers 6 everywhere."""
+    zero = np.zeros(2, int)
+    figures = metrics.height_figures(metrics.tally(zero, np.array([3.0, 4.0]), np.array([2.0, 4.0]), 6.0, 1))
+    assert (figures["mae"], figures["baseline_mae"], figures["mean_height"]) == (0.5, 3.0, 3.0)
+    assert figures["mae_to_baseline"] == pytest.approx(0.5 / 3)
+    assert (figures["mape"], figures["paper_difference"]) == (pytest.approx(25), pytest.approx(0.25 * 3))
+
+
+def test_errors_beyond_a_hundred_metres_stay_in_their_group():
+    errors = metrics.tally(np.array([0, 1]), np.array([160.0, 5.0]), np.array([5.0, 5.0]), 6.1, 2)
+    assert errors.histogram.sum(axis=1).tolist() == [1, 1]
+    figures = metrics.height_figures(errors.of(np.array([0])))
+    assert (figures["mae"], figures["le90"]) == (155.0, 100.0)
+
+
+def test_biases_have_the_sign_of_found_less_true_and_medians_are_no_means():
+    steep = np.tan(np.radians([[30.0], [20.0], [20.0]])) * [1.0, 0.0]
+    found = np.tan(np.radians([[33.0], [20.0], [20.0]])) * [1.0, 0.0]
+    figures = metrics.plane_figures(steep, found)
+    assert figures["slope_bias"] == pytest.approx(1.0)
+    assert (figures["normal_median"], figures["azimuth_median"]) == pytest.approx((0.0, 0.0), abs=1e-5)
+    high = metrics.corner_figures(corners([[10, 10], [20, 10]], [5, 5]), corners([[10, 10], [20, 10]], [6, 5]))
+    assert high["height_bias"] == pytest.approx(0.5)
+
+
+def test_of_two_halves_of_a_section_the_better_score_is_the_match():
+    true, found = np.zeros((10, 10), int), np.zeros((10, 10), int)
+    true[:], found[:, :5], found[:, 5:] = 1, 5, 6
+    assert section_scores(true, found, {5: 0.3, 6: 0.9})["ap50"] == 1.0
+    assert section_scores(true, found, {5: 0.9, 6: 0.3})["ap50"] == 1.0
+
+
+def test_what_is_found_counts_in_the_split_of_the_truth_it_overlaps():
+    """Predictions know no split; what overlaps nothing is testing's."""
+    square = np.array([shapely.Polygon([(0, 0, 5), (4, 0, 5), (4, 4, 5), (0, 4, 5)])] * 3)
+    sections = truth.Truth(np.array([1, 2, 9]), np.array([0, 1, 0]), square, square, np.zeros((3, 4)))
+    ok = np.array(["ok"] * 3, object)
+    predicted = metrics.Predicted(np.array([5, 6, 7]), np.ones(3), np.full(3, 2), np.zeros((3, 2)), ok)
+    pairs = metrics.Pairs(np.array([1, 2, 0]), np.array([5, 6, 7]), np.array([10, 20, 30]))
+    nothing = metrics.no_errors(len(evaluate.SPLITS) * len(evaluate.HEIGHT_EDGES))
+    reading = evaluate.Reading(pairs, nothing, nothing, corners(np.zeros((0, 2)), []), None, None, None)
+    figures = evaluate.evaluation(reading, sections, predicted, None, 6.1)
+    counted = [tuple(figures["sections"][s][k] for k in ("truth", "predicted", "matched")) for s in evaluate.SPLITS]
+    assert counted == [(1, 1, 1), (1, 1, 1), (0, 1, 0)]
+    assert [figures["pixels"][s]["true_positive"] for s in evaluate.SPLITS] == [10, 20, 0]
+    assert [figures["pixels"][s]["false_positive"] for s in evaluate.SPLITS] == [0, 0, 30]
+    assert figures["sections"]["all"]["hidden"] == 1  # the truth section 9 shows nowhere
+
+
+def test_heights_are_counted_in_their_own_bin(tmp_path):
+    scene = toy.make_scene(tmp_path, direction=None)
+    figures = run(tmp_path, scene)["heights"]["all_truth"]
+    _, heights = truth.visible_labels(truth.read(tmp_path / "truth.parquet", scene), scene, rasters_window(scene))
+    expected = np.histogram(heights[np.isfinite(heights)], [*evaluate.HEIGHT_EDGES, np.inf])[0]
+    assert np.count_nonzero(expected) > 3
+    assert [figures[name]["pixels"] for name in evaluate.bin_names()] == expected.tolist()

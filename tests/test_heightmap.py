@@ -75,3 +75,12 @@ def test_table_and_back():
     table = heightmap.table(np.array([4, 5, 9]), sums)
     assert (heightmap.column(table["sums"]) == sums).all()
     assert (heightmap.column(table.slice(1, 1)["sums"]) == sums[1:2]).all()
+
+
+def test_points_are_as_sure_together_as_the_cells():
+    """Only LOCAL of a cell's σ is its own: n cells tell as much as four points of LOCAL·σ·√(4/n) each."""
+    (row,) = heightmap.sums_by_label(np.where(labels() == 3, 3, 0), plane_map(0, 0, 5.0), np.full((16, 16), 2.0), 0, 0)[
+        1
+    ]
+    sigma = heightmap.points(row)[:, 3]
+    assert (sigma**-2).sum() == pytest.approx(row[0] * (heightmap.LOCAL * 2.0) ** -2)

@@ -237,3 +237,78 @@ def test_regions_without_angles_are_refused(tmp_path):
     frame.to_file(tmp_path / "bare.gpkg")
     with pytest.raises(regions.RegionsUnusable, match="lacks the column view_azimuth and view_elevation"):
         scene.build("m", raster, 0.0, 0.5, tmp_path, regions=tmp_path / "bare.gpkg")
+
+
+def test_of_several_images_the_first_counts(tmp_path):
+    more = (
+        "BEGIN_GROUP = IMAGE_2\n\tmeanSunAz = 1.0;\n\tmeanSatAz = 10.0;\n\tmeanSatEl = 70.0;\nEND_GROUP = IMAGE_2\nEND;"
+    )
+    text = IMD.replace("END;", more)
+    assert metadata.read(written(tmp_path, "a.IMD", text)) == Angles(181.1, 59.3, 155.4, 45.2)
+    twice = MAXAR_XML.replace("</isd>", "<IMD><MEANSATAZ>10.0</MEANSATAZ><MEANSATEL>70</MEANSATEL></IMD></isd>")
+    assert metadata.read(written(tmp_path, "a.XML", twice)) == Angles(181.1, 59.3, 155.4, 45.2)
+
+
+@pytest.mark.parametrize("text", [json.dumps(STAC), MAXAR_XML, IMD], ids=["STAC", "XML", "IMD"])
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path, text):
+    (tmp_path / "a.txt").write_text(text, encoding="utf-8-sig")
+    assert metadata.read(tmp_path / "a.txt")[:2] == (181.1, 59.3)
+
+
+def test_rpc_polynomials_are_those_of_gdal():
+    """All 20 terms of all four polynomials, against GDAL's own transformer; the two count pixels from other corners."""
+    from rasterio.transform import RPCTransformer
+
+    random = np.random.default_rng(4)
+    terms = random.uniform(-0.05, 0.05, (4, 20))
+    terms[[0, 2], 1:3] += [[0.2, -1.0], [1.0, 0.2]]
+    terms[[1, 3], 0] = 1.0
+    made = linear_rpc(180.0, 60.0)
+    names = ("line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff")
+    for name, values in zip(names, terms, strict=True):
+        setattr(made, name, values.tolist())
+    offset = np.array([made.line_off, made.samp_off, made.lat_off, made.long_off, made.height_off])
+    scale = np.array([made.line_scale, made.samp_scale, made.lat_scale, made.long_scale, made.height_scale])
+    rpc = metadata.Rpc(offset, scale, terms)
+    there = np.column_stack(
+        [
+            made.long_off + random.uniform(-0.9, 0.9, 20) * made.long_scale,
+            made.lat_off + random.uniform(-0.9, 0.9, 20) * made.lat_scale,
+            random.uniform(-400, 400, 20),
+        ]
+    )
+    with RPCTransformer(made) as gdal:
+        expected = np.column_stack(gdal.rowcol(*there.T, op=np.asarray)).astype(float)
+    found = np.array([rpc.image(*place) for place in there])
+    np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("incidence", [12.0, 59.3])
+def test_incidence_must_go_with_off_nadir_from_both_sides(tmp_path, incidence):
+    item = {**STAC, "properties": {**STAC["properties"], "view:incidence_angle": incidence}}
+    with pytest.raises(MetadataUnusable, match="contradicts itself"):
+        metadata.read(written(tmp_path, "item.json", json.dumps(item)))
+
+
+def layer(tmp_path, azimuths, shapes, crs="EPSG:32631"):
+    frame = geopandas.GeoDataFrame({"view_azimuth": azimuths, "view_elevation": 60.0}, geometry=shapes, crs=crs)
+    frame.to_file(tmp_path / "regions.gpkg")
+    return tmp_path / "regions.gpkg"
+
+
+def test_views_of_regions_are_told_once_each_and_within_a_circle(tmp_path):
+    path = layer(tmp_path, [-90.0, 181.0, -90.0], [shapely.box(i, 0, i + 1, 1) for i in range(3)])
+    assert regions.views(path) == [{"azimuth": 270.0, "elevation": 60.0}, {"azimuth": 181.0, "elevation": 60.0}]
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "shape", "crs", "match"),
+    [
+        (float("nan"), shapely.box(0, 0, 1, 1), "EPSG:32631", "has no view_azimuth"),
+        (10.0, shapely.Point(0, 0), "EPSG:32631", "no polygon"),
+        (10.0, shapely.box(0, 0, 1, 1), None, "no CRS"),
+    ],
+)
+def test_regions_that_cannot_be_used_say_why(tmp_path, azimuth, shape, crs, match):
+    with pytest.raises(regions.RegionsUnusable, match=match):
+        regions.views(layer(tmp_path, [azimuth], [shape], crs))

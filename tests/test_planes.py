@@ -243,3 +243,45 @@ def test_a_corner_on_a_neighbours_rim_is_the_neighbours_even_where_that_is_not_a
     alone = planes.file_corners(np.array([mine]), corners, free, np.zeros(1, int), 6.0, 2.0, [other])
     assert len(alone[0]) == 0
     assert neighbours("r000c001") == ["r000c000", "r000c002", "r001c000", "r001c001", "r001c002"]
+
+
+def test_sigma_of_a_level_plane_is_that_of_the_mean():
+    xyz = np.array([[1.0, 1.0, 104.0], [2.0, 3.0, 108.0]])
+    two = planes.fit(points(xyz, 0.5, 100.0), 50.0, MIDDLE, 100.0, (6.11, 3.0), "robust")
+    assert two.sigma == pytest.approx(0.5 / np.sqrt(2))
+    one = planes.fit(points(xyz[:1], 0.02, 100.0), 50.0, MIDDLE, 100.0, (6.11, 3.0), "robust")
+    assert one.sigma == pytest.approx(planes.SIGMA_FLOOR)
+
+
+@pytest.mark.parametrize(("angle", "status"), [(71.0, "ok"), (73.0, "implausible_slope")])
+def test_roofs_are_at_most_72_degrees_steep(angle, status):
+    steep = planes.Fit(view.Plane(np.tan(np.radians(angle)), 0.0, 10.0, 4.0, 3.0), 0.1, "ok", "")
+    middle = np.array([4.0, 3.0])
+    rim = planes.Rim(RIM.seen * [0.1, 1.0] + [3.6, 0.0], RIM.base, np.zeros(2))
+    assert planes.checked(steep, np.array([10.0]), 400.0, 0.0, middle, rim, False, False).status == status
+
+
+def test_a_plane_that_climbs_beyond_any_building_is_made_level():
+    """100 m high in its middle, 250 m at its end."""
+    long = planes.Rim(np.array([[-150.0, 0.0], [150.0, 0.0], [150.0, 6.0], [-150.0, 6.0]]), np.zeros(4), np.zeros(2))
+    found = planes.Fit(view.Plane(0.7, 0.0, 100.0, *MIDDLE), 0.1, "ok", "")
+    result = planes.checked(found, np.array([90.0]), 400.0, 0.0, MIDDLE, long, False, False)
+    assert (result.status, result.plane.a, result.plane.c) == ("implausible_height", 0, 90.0)
+    assert "205 m" in result.reason
+
+
+def test_of_several_statuses_the_outermost_cause_is_told():
+    found = planes.fit(on_plane(SQUARE), 80.0, MIDDLE, 0.0, (6.11, 3.0), "robust")
+
+    def told(area, edge, void):
+        return planes.checked(found, on_plane(SQUARE).height, area, 0.0, MIDDLE, RIM, edge, void).status
+
+    assert told(4.0, False, True) == "cloud_or_nodata"
+    assert told(4.0, True, True) == told(400.0, True, True) == "raster_edge"
+
+
+def test_few_cells_and_good_corners_are_a_plane_that_can_be_trusted():
+    """One cell of the height map tells no slope; corners that span the section do."""
+    cells = planes.Cells(on_plane(SQUARE), 1.0, 0.2)
+    assert planes.fit(on_plane(SQUARE), 80.0, MIDDLE, 0.0, (6.11, 3.0), "robust", cells).status == "ok"
+    assert planes.fit(on_plane(SQUARE[:2]), 80.0, MIDDLE, 0.0, (6.11, 3.0), "robust", cells).status == "two_corners"

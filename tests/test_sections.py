@@ -98,3 +98,32 @@ def test_networks_see_a_mirror_image_beyond_the_raster(size):
                 rows, cols = np.nonzero(data)
                 assert (rows.min(), cols.min()) == before
                 assert data.sum() == inside.height * inside.width
+
+
+def test_a_tile_half_without_data_is_burnt_out_by_what_it_has():
+    rgb, valid, views, core = block(0.4)
+    valid[MARGIN : MARGIN + 48, MARGIN + 25 :] = False  # 19 of 25 columns are white
+    burnt = sections.burnt_out(rgb, valid, views, TILING, core)
+    assert burnt[MARGIN : MARGIN + 48, MARGIN : MARGIN + 48].all()
+    assert not sections.burnt_out(*block(0.4)[:3], TILING, core).any()
+
+
+def test_a_coloured_tile_is_not_burnt_out():
+    """Red roofs or bare sand may saturate one band; cloud, snow and glare saturate all."""
+    rgb, valid, views, core = block(0.9)
+    rgb[..., 2] = 120
+    assert not sections.burnt_out(rgb, valid, views, TILING, core).any()
+
+
+def test_sections_end_where_the_data_ends():
+    tile = next(iter(TILING.tiles(TILING.blocks(96, 96)[0], 96, 96)))
+    roof = np.zeros((SIDE, SIDE), np.float32)
+    roof[20:40, 20:40] = 1.0
+    outputs = {"roof": roof[None], "edge": 0 * roof[None], "distance": roof[None]}
+    terms = {"head": "dense", "tile": SIDE, "thresholds": {"roof": 0.5, "min_area": 10}}
+    data = np.ones((SIDE, SIDE), bool)
+    data[:, 30:] = False
+    view = sections.view_of(tile, np.zeros((SIDE, SIDE, 3), np.uint8), outputs, terms, MARGIN, data, 7)
+    assert (view.labels == 8).sum() == 20 * 10
+    assert not view.labels[~data].any()
+    assert view.evidence[0, scoring.EVIDENCE.index("area")] == 20 * 10

@@ -469,3 +469,29 @@ def test_a_gap_between_drawn_sections_is_closed_only_where_a_step_hid_it(seen, a
     footprint = sum(shapely.area(shapely.get_parts(one.base)))
     assert footprint == pytest.approx(200.0 + (10 * apart if closed else 0.0), abs=0.1)
     assert shells_are_valid(one)
+
+
+def test_a_buildings_uncertainty_is_that_of_its_sections_by_area():
+    large, small = shapely.box(0, 0, 9, 8), shapely.box(9, 0, 12, 8)
+    flat = np.array([[0, 0, 4.0], [0, 0, 6.5]])
+    sections = solids.Sections(
+        np.array([1, 2]), [large, small], flat, ["ok"] * 2, np.array([0.2, 0.6]), (0, 0), spread=np.array([0.4, 1.2])
+    )
+    solid = solids.build(sections, FLAT)
+    row = features.attributes(1, sections, solid)
+    assert (row["height_sigma"], row["position_sigma"], row["position_corrected"]) == (0.3, 0.6, True)
+    unknown = features.attributes(1, sections._replace(spread=np.full(2, np.nan)), solid)
+    assert (unknown["position_sigma"], unknown["position_corrected"]) == (None, False)
+
+
+def test_roof_surfaces_say_how_they_lie():
+    """A gable's two slopes fall north and south of the grid, which is turned against true north by 1.5°."""
+    sections, solid, row = built(houses.GABLE)
+    line = features.feature(row, sections, solid, (500_000, 5_400_000), 1.5)
+    (geometry,) = line["CityObjects"]["building-1"]["geometry"]
+    roofs = {s["section_id"]: s for s in geometry["semantics"]["surfaces"] if s["type"] == "RoofSurface"}
+    for number, (ring, (_, b, _)) in enumerate(houses.GABLE, start=1):
+        slope = np.arctan(abs(b))
+        assert roofs[number]["slope"] == pytest.approx(np.degrees(slope), abs=0.01)
+        assert roofs[number]["azimuth"] == (1.5 if b < 0 else 181.5)
+        assert roofs[number]["area"] == pytest.approx(shapely.Polygon(ring).area / np.cos(slope), abs=0.01)

@@ -255,3 +255,57 @@ def test_simplified_outlines_keep_sharing_rims(seed):
     assert shapely.area(smooth).sum() == pytest.approx(shapely.area(union), abs=1e-6)
     assert not shapely.get_num_interior_rings(shapely.get_parts(union)).any()
     assert abs(shapely.area(union) - 256) < 12
+
+
+def parts(boxes, group, **columns):
+    """Pieces without evidence or heights."""
+    n = len(boxes)
+    none = np.zeros(n, np.int64)
+    values = {"score": np.full(n, 0.5), "void": none > 0, "split": none, "owner": none, **columns}
+    return stitch.Parts(
+        none,
+        np.array(group),
+        np.array(boxes, object),
+        *(np.array(values[name]) for name in ("score", "void", "split", "owner")),
+        scoring.none(n),
+        np.zeros((n, len(heightmap.SUMS))),
+    )
+
+
+def test_what_a_section_has_of_its_pieces():
+    """Void as soon as one piece is; the score is the mean by area."""
+    boxes = [shapely.box(0, 0, 4, 10), shapely.box(4, 0, 16, 10), shapely.box(40, 0, 50, 10)]
+    whole = stitch.united(
+        parts(boxes, [0, 0, 1], score=[0.2, 0.6, 0.3], void=[True, False, False], split=[2, 0, 1], owner=[0, 7, 0])
+    )
+    assert shapely.area(whole.geometry).tolist() == [160, 100]
+    assert whole.score == pytest.approx([0.5, 0.3])
+    assert whole.void.tolist() == [True, False]
+    assert (whole.split.tolist(), whole.owner.tolist()) == ([2, 1], [7, 0])
+
+
+def test_sections_at_each_side_of_the_raster_are_cut_by_it():
+    grid = Grid("EPSG:32631", 0.0, 0.0, 1.0, 50, 40)
+    boxes = [(0, 9, 9, 19), (9, 0, 19, 9), (41, 9, 50, 19), (9, 31, 19, 40), (1, 1, 49, 39)]
+    outlines = np.array([shapely.box(*box) for box in boxes])
+    assert stitch.touches_edge(outlines, grid).tolist() == [True] * 4 + [False]
+
+
+def test_of_two_tiles_views_of_a_corner_the_better_stays():
+    """Two corners of one tile are two, and what truth says is never merged."""
+    rows = [  # tile, place, score, owner
+        (0, 10.0, 0.4, 0),
+        (1, 11.0, 0.9, 0),
+        (0, 30.0, 0.4, 0),
+        (0, 31.0, 0.9, 0),
+        (0, 50.0, 0.4, 3),
+        (1, 51.0, 0.9, 4),
+    ]
+    table = pa.Table.from_pylist(
+        [
+            {"tile_row": 0, "tile_col": tile, "col": x, "row": 5.0, "height": 6.0, "sigma": 0.5, "score": s, "owner": o}
+            for tile, x, s, o in rows
+        ],
+        corners.CORNERS,
+    )
+    assert stitch.distinct_corners(table)["col"].to_pylist() == [11.0, 30.0, 31.0, 50.0, 51.0]

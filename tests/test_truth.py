@@ -332,3 +332,21 @@ def test_the_simulator_sees_the_same(tmp_path):
     assert roof.sum() > 5000
     assert same.sum() > 0.98 * roof.sum()
     np.testing.assert_allclose(heights[same], picture.height[same], atol=1e-4)
+
+
+def test_feet_of_a_vertical_crs_become_metres(tmp_path):
+    """EPSG:6360 is NAVD88 height in US survey feet."""
+    scene = toy.make_scene(tmp_path / "scene")
+    standing = np.array([outline for _, _, outline in toy.roofs()])
+    feet = shapely.transform(standing, lambda p: p * [1, 1, 3937 / 1200], include_z=True)
+    found = truth.to_grid(truth.Layer("t", "EPSG:32631+6360", feet, {}), scene.grid)
+    np.testing.assert_allclose(coordinates(found), coordinates(standing), atol=1e-6)
+
+
+def test_planes_of_outlines_without_one_are_level_at_their_mean():
+    """A line in plan, and a wall that passes for a roof."""
+    line = shapely.Polygon([(0, 0, 1), (4, 0, 3), (8, 0, 5)])
+    wall = shapely.Polygon([(0, 0, 0), (4, 0, 0), (4, 1, 6), (0, 1, 6)])
+    roof = shapely.Polygon([(0, 0, 0), (4, 0, 0), (4, 1, 4), (0, 1, 4)])
+    found = truth.planes_of(np.array([line, wall, roof]))
+    np.testing.assert_allclose(found[:, :3], [[0, 0, 3], [0, 0, 3], [0, 4, 2]], atol=1e-9)

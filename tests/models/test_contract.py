@@ -114,3 +114,48 @@ def test_geometry_vector_points_where_roofs_are_seen():
     vector = runtime.geometry_vector(lean(180.0, 45.0), lean(90.0, 45.0), 0.5)
     np.testing.assert_allclose(vector, [[0, -2, -2, 0, 1, 1]], atol=1e-6)
     assert not runtime.geometry_vector(None, None, 0.5).any()
+
+
+def test_how_far_below_a_range_of_azimuths():
+    assert contract.beyond(345, [350, 10], circular=True) == 5
+    assert contract.beyond(95, [100, 200], circular=True) == 5
+
+
+def test_sun_and_azimuths_count_as_the_view_does(tmp_path):
+    ranges = {"view_azimuth": [350, 20], "sun_elevation": [30, 60]}
+    terms = toy.contract("sections", trained_on={"data": ["toy"], "licence": "CC0-1.0", **ranges})
+    model = contract.load(toy.sections_model(tmp_path / "s.onnx", terms))
+
+    def told(azimuth, sun):
+        return contract.check_angles(model, {"azimuth": azimuth, "elevation": 60.0}, {"azimuth": 1.0, "elevation": sun})
+
+    assert told(5.0, 45.0) == told(355.0, 45.0) == told(5.0, 28.0) == []
+    assert "sun elevation 26° is 4.0° outside" in told(5.0, 26.0)[0]
+    with pytest.raises(AngleOutsideTraining, match="sun elevation 20°"):
+        told(5.0, 20.0)
+    with pytest.raises(AngleOutsideTraining, match="view azimuth 30°"):
+        told(30.0, 45.0)
+
+
+@pytest.mark.parametrize(("elevation", "warned", "refused"), [(47.1, 0, 0), (46.9, 1, 0), (45.1, 1, 0), (44.9, 1, 1)])
+def test_three_degrees_are_warned_of_and_five_refused(tmp_path, elevation, warned, refused):
+    model = contract.load(toy.sections_model(tmp_path / "s.onnx"))  # trained on 50 to 90°
+    seen = {"azimuth": 180.0, "elevation": elevation}
+    assert len(contract.check_angles(model, seen, None, allow=True)) == warned
+    if refused:
+        with pytest.raises(AngleOutsideTraining):
+            contract.check_angles(model, seen, None)
+    else:
+        assert len(contract.check_angles(model, seen, None)) == warned
+
+
+def test_means_are_in_the_order_of_the_networks_channels():
+    rgb = np.full((1, 1, 3), (10, 20, 30), np.uint8)
+    terms = {"input": {"channels": "BGR", "scale": 1.0, "mean": [1.0, 2.0, 3.0], "std": [1.0, 2.0, 4.0]}}
+    assert contract.normalise(rgb, terms)[0, :, 0, 0].tolist() == [29.0, 9.0, 1.75]
+
+
+def test_height_bins_have_an_edge_more_than_centres(tmp_path):
+    terms = toy.contract("corners", heights={"edges": [0, 1, 2], "centres": [0.5], "fallback": 6.0})
+    with pytest.raises(ContractMismatch, match="one edge more"):
+        contract.load(toy.corners_model(tmp_path / "corners.onnx", terms))

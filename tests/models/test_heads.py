@@ -178,3 +178,24 @@ def test_small_sections_that_touch_are_one_that_is_large_enough():
     for order in (labels, np.where(labels > 0, 3 - labels, 0)):
         assert (heads.absorb_small(order, 16) == (labels > 0)).all()
     assert not heads.absorb_small(labels, 25).any()
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_a_corners_height_is_read_where_the_corner_lies(stride):
+    """Heights rise along the columns, σ along the rows: neither axis may be taken for the other."""
+    n = 32 // stride
+    along = (np.arange(n) + 0.5) * stride / 32
+    height = np.stack([np.broadcast_to(1 - along, (n, n)), np.broadcast_to(along, (n, n)), np.zeros((n, n))])
+    corner, offset = np.zeros((32, 32)), np.zeros((2, 32, 32))
+    corner[10, 20] = 0.9
+    offset[:, 10, 20] = 0.3, -0.2
+    found = heads.dense_corners(corner, offset, height, HEIGHTS, THRESHOLDS, 32)
+    assert found.height[0] == pytest.approx(0.5 + 20.8 / 32)
+
+
+@pytest.mark.parametrize(("apart", "n"), [(1, 1), (2, 1), (3, 2)])
+def test_peaks_within_two_cells_are_one_corner(apart, n):
+    corner = np.zeros((32, 32))
+    corner[10, 10], corner[10, 10 + apart] = 0.9, 0.8
+    found = heads.dense_corners(corner, np.zeros((2, 32, 32)), np.ones((3, 8, 8)) / 3, HEIGHTS, THRESHOLDS, 32)
+    assert len(found.col) == n

@@ -109,3 +109,34 @@ def test_a_section_without_plane_is_left_out(tmp_path):
 
     store.write_table(tmp_path / "b.parquet", pa.Table.from_pylist(rows))
     assert rasters.read([str(tmp_path / "b.parquet")]).ids.tolist() == [12, 13, 14]
+
+
+def test_overviews_show_heights_that_are_there(tmp_path):
+    """Not means of a roof and the ground beside it, or of two roofs."""
+    scene = toy.make_scene(tmp_path, size=(1200, 700))
+    _, heights = publish(tmp_path, scene)
+    with rasterio.open(tmp_path / "heights.tif", overview_level=0) as file:
+        small = file.read(1)
+    assert small.shape == (350, 600)
+    blocks = heights.reshape(350, 2, 600, 2)
+    same = (blocks == small[:, None, :, None]) | (np.isnan(blocks) & np.isnan(small)[:, None, :, None])
+    assert same.any(axis=(1, 3)).all()
+
+
+def test_what_the_files_say_of_themselves(tmp_path):
+    scene = toy.make_scene(tmp_path)
+    publish(tmp_path, scene)
+    with rasterio.open(tmp_path / "labels.tif") as labels, rasterio.open(tmp_path / "heights.tif") as heights:
+        assert labels.nodata == 0
+        assert np.isnan(heights.nodata)
+        assert heights.tags()["UNIT"] == "m above ground"
+
+
+def test_ids_that_do_not_fit_are_refused(tmp_path):
+    rows = toy.buildings_table(toy.make_scene(tmp_path)).to_pylist()
+    rows[0]["section_id"] = 2**32
+    import pyarrow as pa
+
+    store.write_table(tmp_path / "b.parquet", pa.Table.from_pylist(rows))
+    with pytest.raises(rasters.IdsTooLarge, match="4294967296"):
+        rasters.read([str(tmp_path / "b.parquet")])

@@ -60,3 +60,15 @@ def test_a_scene_without_failures_and_truth():
     text = report.page(RUN, None, {})
     assert "failed" not in text
     assert "truth" not in text
+
+
+def test_from_where_a_scene_is_seen():
+    def told(**scene):
+        return report.page({**RUN, "scene": {**RUN["scene"], **scene}}, None, {})
+
+    assert "azimuth 181.1°, elevation 59.3°" in told()
+    assert '<td class="n">unknown</td>' in told(view=None)
+    both = told(regions=[{}, {}], position_corrected=False)
+    assert "elevation 59.3° and 2 regions with views of their own" in both
+    assert 'where they stand</td><td class="n">no<' in both
+    assert "5.00 km²" in told(grid={"width": 5000, "height": 4000, "gsd": 0.5})

@@ -125,3 +125,12 @@ def test_regions_alone_move_roofs_too(tmp_path):
 def test_a_missing_input_is_named(tmp_path):
     with pytest.raises(run.InputMissing, match=r"gone\.tif"):
         run.inputs([str(tmp_path / "gone.tif")], tmp_path / "cache.json")
+
+
+def test_the_share_of_full_roofs():
+    """Of buildings with a section that is ok: full where nine tenths of their sections are faithful, whatever it is called."""
+    sections = pa.table({"building_id": [1, 2, 3, 4, 5, 5, 6], "status": ["ok"] * 4 + ["too_small", "ok", "too_small"]})
+    solids = [(1, "2.0", 1.0), (2, "2.2", 0.9), (3, "2.0", 0.89), (4, "1.3", 1.0), (5, "2.0", None), (6, "0", None)]
+    table = pa.Table.from_pylist([{"building_id": b, "lod": lod, "faithful": f} for b, lod, f in solids])
+    assert run.lod2(sections, table) == {"with_ok_section": 5, "lod2": 3, "share": 0.6, "without_solid": 1}
+    assert run.lod2(sections.slice(4, 1), table)["share"] is None

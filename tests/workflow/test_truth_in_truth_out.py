@@ -47,4 +47,10 @@ def test_truth_in_truth_out(tmp_path, slope):
             f"{layer}: {len(whole) - matched} of {len(whole)} sections are not where they were"
         )
     evaluation = json.loads((folder / "evaluation.json").read_text())
-    assert evaluation
+    figures = (
+        evaluation["pixels"]["all"]["iou"],
+        evaluation["sections"]["all"]["ap50"],
+        evaluation["sections"]["all"]["pq"],
+    )
+    assert min(figures) > 0.97, figures
+    assert evaluation["heights"]["found"]["all"]["mae"] < 0.05
