@@ -73,25 +73,30 @@ def ground_position(
     image = np.asarray(image, float)
     k = np.asarray(k, float)
     base = (projected_on or terrain)(image)
-    start = image + np.asarray(height, float)[..., None] * k
-    position = _settled(start, lambda at: image + (height + terrain(at) - base)[..., None] * k)
+    height, k = np.broadcast_to(np.asarray(height, float), base.shape), np.broadcast_to(k, image.shape)
+
+    def step(at: np.ndarray, some: np.ndarray) -> np.ndarray:
+        return image[some] + (height[some] + terrain(at) - base[some])[:, None] * k[some]
+
+    position = _settled(image + height[:, None] * k, step)
     return position, terrain(position) + height
 
 
-def _settled(position: np.ndarray, step: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Where points (n, 2) come to rest by steps from place to place (m), each by itself, whatever others do.
+def _settled(position: np.ndarray, step: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Where points (n, 2) come to rest by steps from place to place (m) of some of them (indices).
 
-    Those that swing about their place are taken there by shorter and shorter steps.
+    Each does by itself, whatever others do; those that swing about their place are taken there by shorter and shorter steps.
     """
-    moving = np.ones(position.shape[:-1], bool)
+    position = position.copy()
+    moving = np.arange(len(position))
     for number in range(ROUNDS):
-        moved = step(position)
+        before = position[moving]
+        moved = step(before, moving)
         if number >= ROUNDS // 4:
-            moved = position + 0.5 ** (4 * number // ROUNDS) * (moved - position)
-        still = np.abs(moved - position).max(axis=-1, initial=0.0) < SETTLED
-        position = np.where(moving[..., None], moved, position)
-        moving = moving & ~still
-        if not moving.any():
+            moved = before + 0.5 ** (4 * number // ROUNDS) * (moved - before)
+        position[moving] = moved
+        moving = moving[np.abs(moved - before).max(axis=-1) >= SETTLED]
+        if not len(moving):
             break
     return position
 
@@ -100,7 +105,8 @@ def image_position(ground: np.ndarray, z: np.ndarray, k: Lean, projected_on: Sur
     """Where the image shows points standing at `ground` (n, 2) with absolute height `z` (n,): the inverse of the above."""
     ground = np.asarray(ground, float)
     k = np.asarray(k, float)
-    return _settled(ground, lambda at: ground - (z - projected_on(at))[..., None] * k)
+    z, k = np.broadcast_to(np.asarray(z, float), ground.shape[:-1]), np.broadcast_to(k, ground.shape)
+    return _settled(ground, lambda at, some: ground[some] - (z[some] - projected_on(at))[:, None] * k[some])
 
 
 def ray_meets_plane(image: np.ndarray, plane: Plane, k: Lean, projected_on: Surface) -> tuple[np.ndarray, np.ndarray]:
