@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
+import good_inputs
 import numpy as np
 import pytest
 import yaml
-
-sys.path.insert(0, str(Path(__file__).parent / "faults"))
-import cases
 
 from kibs_steps import check, plan
 
@@ -20,7 +17,7 @@ STEPS = ("tiles", "sections", "corners", "planes", "ground", "solids")
 
 def test_a_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config = {**cases.good(tmp_path), "dtm": 30}
+    config = {**good_inputs.good(tmp_path), "dtm": 30}
     ((name, values),) = plan.scenes(config, SCHEMA).items()
     planned = plan.plan(name, values, tmp_path, tmp_path / "results")
     before = {p for p in tmp_path.rglob("*") if "fingerprints" not in p.name}
@@ -35,7 +32,7 @@ def test_a_page(tmp_path, monkeypatch):
 
 def test_only_what_a_run_does_is_timed(tmp_path, monkeypatch):
     """As many looks as the scene gets, told its view; no 3D model where a surface model gives the heights."""
-    config = {**cases.good(tmp_path), "dtm": 30, "looks": 1}
+    config = {**good_inputs.good(tmp_path), "dtm": 30, "looks": 1}
     seen = []
 
     def spy(model, geometry, provider, threads, looks):
@@ -70,7 +67,7 @@ def test_a_page_of_a_simulated_city(tmp_path, monkeypatch):
     """Its CRS is in the city file."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "city.json").write_text("{}")
-    config = {k: v for k, v in cases.good(tmp_path).items() if k not in ("raster", "dtm", "truth")}
+    config = {k: v for k, v in good_inputs.good(tmp_path).items() if k not in ("raster", "dtm", "truth")}
     config |= {"simulate": {"seed": 1, "size": 128, "city": "city.json"}, "sun_azimuth": 150.0, "sun_elevation": 45.0}
     ((name, values),) = plan.scenes(config, SCHEMA).items()
     planned = plan.plan(name, values, tmp_path, tmp_path / "results")

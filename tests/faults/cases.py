@@ -1,5 +1,7 @@
 """Bad inputs, one case each: how it is made, and the message it must get. docs/inputs.md is written from this table.
 
+What is not bad about a case comes from `good_inputs`.
+
 `…` in a message stands for anything (numbers of bytes, a library's own words). Run `python tests/faults/cases.py` from the
 project's folder to write the page's tables anew.
 """
@@ -23,10 +25,9 @@ import rasters
 import shapely
 import toy
 from affine import Affine
+from good_inputs import BOX, CRS, ground, picture, roof, vector
 
 PAGE = Path(__file__).parents[2] / "docs/inputs.md"
-CRS = "EPSG:32631"
-BOX = (rasters.X0 + 10.0, rasters.Y0 - 20.0, rasters.X0 + 16.0, rasters.Y0 - 12.0)
 
 
 class Case(NamedTuple):
@@ -52,42 +53,6 @@ def case(part: str, given: str, error: str, message: str) -> Callable:
         return make
 
     return add
-
-
-def good(folder: Path) -> dict:
-    """Settings that work."""
-    return {
-        "scene": "s",
-        "raster": str(rasters.write(folder / "a.tif", rasters.picture())),
-        "dtm": str(ground(folder / "dtm.tif")),
-        "models": str(toy.models(folder / "models")),
-        "block": 2,
-        **toy.VIEW,
-    }
-
-
-def ground(path: Path, heights: np.ndarray | None = None, crs: str | None = CRS, **options) -> Path:
-    """A terrain model around the picture."""
-    heights = np.full((330, 340), 50, "float32") if heights is None else heights
-    return rasters.dtm(path, heights, rasters.X0 - 300, rasters.Y0 + 300, crs=crs, **options)
-
-
-def vector(path: Path, shapes: list, crs: str | None = CRS) -> Path:
-    """A vector file of one layer."""
-    import geopandas
-
-    geopandas.GeoSeries(shapes, crs=crs).to_file(path)
-    return path
-
-
-def roof(z: float = 58.0) -> shapely.Polygon:
-    """A section with heights, inside the picture."""
-    return shapely.force_3d(shapely.box(*BOX), z)
-
-
-def picture(folder: Path, name: str, **options) -> dict:
-    """Settings with another raster."""
-    return {"raster": str(rasters.write(folder / name, options.pop("values", rasters.picture()), **options))}
 
 
 @case("raster", "a file that is not there", "RasterMissing", "raster nowhere.tif does not exist: check the path")

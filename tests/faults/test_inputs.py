@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import cases
+import good_inputs
 import numpy as np
 import pyproj
 import pytest
@@ -43,7 +44,7 @@ def attempt(folder: Path, config: dict) -> list[str]:
 @pytest.mark.parametrize("case", cases.CASES, ids=lambda c: f"{c.part}: {c.given}")
 def test_refused(case, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config = {**cases.good(tmp_path), **case.make(tmp_path)}
+    config = {**good_inputs.good(tmp_path), **case.make(tmp_path)}
     with pytest.raises(KibsError) as caught:
         attempt(tmp_path, config)
     said = str(caught.value).replace(f"{tmp_path}/", "")
@@ -53,7 +54,7 @@ def test_refused(case, tmp_path, monkeypatch):
 
 
 def test_the_good_input_is_taken(tmp_path):
-    assert attempt(tmp_path, cases.good(tmp_path)) == []
+    assert attempt(tmp_path, good_inputs.good(tmp_path)) == []
 
 
 def test_the_page_tells_all_cases():
@@ -62,10 +63,10 @@ def test_the_page_tells_all_cases():
 
 def test_a_truth_that_crosses_itself_is_repaired(tmp_path, capsys):
     """A bow tie becomes its two triangles, each with heights."""
-    left, bottom, right, top = cases.BOX
+    left, bottom, right, top = good_inputs.BOX
     spike = [(right, bottom, 58), (right + 2, bottom, 58), (right, bottom, 58)]  # and back again
     tie = shapely.Polygon([(left, bottom, 58), (right, top, 58), *spike, (left, top, 58)])
-    path = cases.vector(tmp_path / "t.gpkg", [tie, cases.roof()])
+    path = good_inputs.vector(tmp_path / "t.gpkg", [tie, good_inputs.roof()])
     layer = truth.read_layer(path, "map")
     assert len(layer.polygons) == 3
     assert shapely.is_valid(layer.polygons).all()
@@ -75,7 +76,7 @@ def test_a_truth_that_crosses_itself_is_repaired(tmp_path, capsys):
 
 
 def test_a_terrain_in_a_crs_in_feet_is_doubted(tmp_path):
-    config = cases.good(tmp_path)
+    config = good_inputs.good(tmp_path)
     place = rasterio.Affine(0.38, 0, 583_000, 0, -0.38, 4_507_000)
     path = rasters.write(tmp_path / "b.tif", rasters.picture(), "EPSG:32618", transform=place)
     heights = np.full((400, 400), 160, "float32")

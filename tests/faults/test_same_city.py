@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import cases
+import good_inputs
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -58,7 +58,7 @@ def build(
     place = rasters.Affine(GSD, 0, left - shift * GSD, 0, -GSD, top + shift * GSD)
     raster = rasters.write(folder / "a.tif", image, transform=place)
     made = scenes.build("s", raster, str(FLAT), GSD, folder, view=view)
-    layer = cases.vector(folder / "truth.gpkg", shapes)
+    layer = good_inputs.vector(folder / "truth.gpkg", shapes)
     out = {name: str(folder / name) for name in ("truth.parquet", "scene.json", "sections.parquet", "corners.parquet")}
     truth.main(["--scene", out["scene.json"], "--truth", str(layer), "--frame", "map", "--out", out["truth.parquet"]])
     (folder / "model.json").write_text(json.dumps({"contract": {"heights": {"fallback": 6.0}}}))
