@@ -27,6 +27,7 @@ from kibs_steps.heightmap import EMPTY
 from kibs_steps.stitch import SECTIONS, distinct_corners, owner_blocks, section_ids, touches_edge
 
 LAYER = "roof_sections_image"
+PUBLISHED = "roof_sections"  # the other layer of `city.gpkg` that has sections, where they stand
 UNREADABLE = "sections {path} cannot be read ({error}): give the edited city.gpkg or a GeoPackage"
 EMPTY_LAYER = f"sections {{path}} holds no polygons: give the layer {LAYER} as edited"
 SAME = 0.01  # px: an outline that moved less was not touched, but perhaps saved in another CRS
@@ -47,11 +48,11 @@ def _say_which(path: str | Path) -> None:
     """Warn of other layers that look like edited sections: of a file with `LAYER` that one is read."""
     import pyogrio
 
-    names = [str(name) for name, kind in pyogrio.list_layers(path) if kind and "Polygon" in str(kind)]
+    names = [str(name) for name, kind in pyogrio.list_layers(path) if "Polygon" in str(kind)]
     if LAYER not in names:
         return
-    known = {LAYER, "roof_sections", "buildings", "footprints", "blocks"}
-    others = [n for n in names if n not in known and "section_id" in pyogrio.read_info(path, layer=n)["fields"]]
+    others = [name for name in names if name not in (LAYER, PUBLISHED)]
+    others = [name for name in others if "section_id" in pyogrio.read_info(path, layer=name)["fields"]]
     if others:
         print(
             f"warning: sections {path}: layer {LAYER} is read, not {', '.join(others)}: give a file of its own if that is meant",
@@ -72,9 +73,8 @@ def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         raise SectionsUnusable(UNREADABLE.format(path=path, error=error)) from error
     rows = len(frame)
     frame["row"] = np.arange(rows)
-    frame = (
-        frame[frame.geometry.notna()].explode().explode(ignore_index=True)
-    )  # collections too, which editing may leave
+    # Parts of collections too, which editing may leave, and of what is in them.
+    frame = frame[frame.geometry.notna()].explode().explode(ignore_index=True)
     frame = frame[frame.geom_type == "Polygon"]
     if frame.empty:
         raise SectionsUnusable(EMPTY_LAYER.format(path=path))

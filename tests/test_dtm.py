@@ -205,12 +205,10 @@ class TestDtm:
             assert np.isfinite(written.read(1)).all()
             assert written.read(1).min() > -50
 
-
-def test_heights_by_scale_and_offset(tmp_path):
-    """Decimetres counted from 1000 m below the datum."""
-    case = TestDtm()
-    values = np.rint((case.heights() + 1000) * 10).astype("int16")
-    path = rasters.dtm(tmp_path / "dtm.tif", values, case.LEFT, case.TOP)
-    with rasterio.open(path, "r+") as target:
-        target.scales, target.offsets = (0.1,), (-1000.0,)
-    case.check(case.scene(tmp_path, path)[0], 0.06)
+    def test_heights_by_scale_and_offset(self, tmp_path):
+        """Decimetres counted from 1000 m below the datum."""
+        values = np.rint((self.heights() + 1000) * 10).astype("int16")
+        path = rasters.dtm(tmp_path / "dtm.tif", values, self.LEFT, self.TOP)
+        with rasterio.open(path, "r+") as target:
+            target.scales, target.offsets = (0.1,), (-1000.0,)
+        self.check(self.scene(tmp_path, path)[0], 0.06)

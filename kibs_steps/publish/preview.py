@@ -188,7 +188,11 @@ def preview(scene: Scene, tables: Iterable[pa.Table]) -> Image.Image:
     right, top = standing_panel(scene, grid, standing, gradients, value["height_mean"], scale)
 
     note = f"{len(seen):,} roof sections" + (f", {len(np.unique(building)):,} buildings" if len(seen) else "")
-    titles = ["as seen from the satellite", "where they stand"]
+    known = scene.view or scene.regions
+    titles = [
+        "as seen from the satellite",
+        "where they stand" if known else "where they are seen (the view is unknown)",
+    ]
     page = picture.sheet([left, right], titles, scene.name, note, foot=76)
     pen = ImageDraw.Draw(page)
     foot = page.height - 38

@@ -80,7 +80,7 @@ def page(run: Mapping[str, Any], evaluation: Mapping[str, Any] | None, pictures:
         step: f"{t['seconds']:.1f} s in {t['jobs']} jobs, up to {t['peak_mb']:.0f} MB"
         for step, t in run["times"].items()
     }
-    parts.append(table("Time", spent))
+    parts.append(table("Time of all steps but the formats", spent))
     parts.append(table("Inputs (sha256; of remote ones what their server says)", dict(map(_identity, run["inputs"]))))
     parts.append(table("Models (sha256)", {item["file"]: item["sha256"] for item in run["models"]}))
     parts.append(table("Versions", run["versions"]))

@@ -1,6 +1,7 @@
 """Label and height rasters against closed forms."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import rasterio
 import rasterio.features
@@ -105,8 +106,6 @@ def test_a_section_without_plane_is_left_out(tmp_path):
     scene = toy.make_scene(tmp_path)
     rows = toy.buildings_table(scene).to_pylist()
     rows[0]["plane_a"] = None
-    import pyarrow as pa
-
     store.write_table(tmp_path / "b.parquet", pa.Table.from_pylist(rows))
     assert rasters.read([str(tmp_path / "b.parquet")]).ids.tolist() == [12, 13, 14]
 
@@ -135,8 +134,6 @@ def test_what_the_files_say_of_themselves(tmp_path):
 def test_ids_that_do_not_fit_are_refused(tmp_path):
     rows = toy.buildings_table(toy.make_scene(tmp_path)).to_pylist()
     rows[0]["section_id"] = 2**32
-    import pyarrow as pa
-
     store.write_table(tmp_path / "b.parquet", pa.Table.from_pylist(rows))
     with pytest.raises(rasters.IdsTooLarge, match="4294967296"):
         rasters.read([str(tmp_path / "b.parquet")])
