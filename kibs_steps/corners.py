@@ -66,6 +66,28 @@ def heights_of_tile(
     return heightmap.table(*heightmap.sums_by_label(core, *found, window.col, window.row))
 
 
+def lifted(
+    found: heads.Corners,
+    shown: tuple[np.ndarray, np.ndarray],
+    outputs: dict[str, np.ndarray],
+    labels: np.ndarray,
+    geometry: np.ndarray,
+    contract: dict,
+) -> tuple[heads.Corners, tuple[np.ndarray, np.ndarray]]:
+    """Corners and height map of a tile with each section lifted as its walls and shadows say (`models.walls`); a corner goes with
+    the sections round it."""
+    from kibs_steps.models import walls
+
+    known, numbers = np.unique(labels, return_inverse=True)
+    numbers = numbers.reshape(labels.shape) + int(known[0] != 0)  # 0: no section
+    seen = walls.traits(numbers, outputs["surface"], outputs["height"], contract["heights"], geometry)
+    lift = walls.lifts(numbers, seen, contract["walls"])
+    mean, sigma = shown
+    cells = heightmap.cells_of(numbers, len(numbers) // len(mean))[: mean.shape[0], : mean.shape[1]]
+    height = found.height + walls.about(numbers, lift, found.col, found.row)
+    return found._replace(height=np.maximum(height, 0.0)), (np.maximum(mean + lift[cells], 0.0), sigma)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Find the roof corners of one block and their heights."""
     from kibs_steps.models import heads, runtime
@@ -91,15 +113,19 @@ def main(argv: list[str] | None = None) -> None:
     labels = sections.unstack(raster.read(args.labels), tiles, tiling.tile)
     images = sections.unstack(raster.read(args.blended), tiles, tiling.tile)
     session = runtime.opened(model, args.provider, args.threads, args.looks)
-    networks = supposed.telling(facts, session, args.supposed)
+    telling = supposed.telling(facts, args.supposed)
     tables, heights = [CORNERS.empty_table()], [heightmap.HEIGHTS.empty_table()]
     for tile in tiles:
         place = tile.row, tile.col
         if not labels[place].any():
             continue  # no section is near that could take its corners
-        outputs = networks(tile.core)(images[place])
-        tables.append(of_tile(heads.decode_corners(outputs, model.contract), tile, tiling))
-        heights.append(heights_of_tile(heads.height_map(outputs, model.contract), labels[place], tile, tiling))
+        geometry = telling(tile.core)
+        outputs = session(geometry)(images[place])
+        found, shown = heads.decode_corners(outputs, model.contract), heads.height_map(outputs, model.contract)
+        if "walls" in model.contract and geometry[0, 4]:  # from an unknown view nobody knows where a base is shown
+            found, shown = lifted(found, shown, outputs, labels[place], geometry[0], model.contract)
+        tables.append(of_tile(found, tile, tiling))
+        heights.append(heights_of_tile(shown, labels[place], tile, tiling))
     store.write_table(args.out, pa.concat_tables(tables))
     store.write_table(args.heights, pa.concat_tables(heights))
 

@@ -59,20 +59,34 @@ def column(lists: pa.ChunkedArray, width: int = len(SUMS)) -> NDArray[np.float64
     return np.concatenate([*parts, np.zeros(0)]).reshape(-1, width)
 
 
+def plane(sums: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Height above ground (m) as a·col + b·row + c (px), by least squares over a section's cells; level across a piece one cell
+    wide."""
+    middle, gradient, height, *_ = _moments(sums)
+    return float(gradient[0]), float(gradient[1]), float(height - gradient @ middle)
+
+
 def points(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     """Four points (4, 4: col, row px, height, σ m) that fix the same plane as a section's cells; none (0, 4) without cells.
 
     They lie on the cells' principal axes, so their least squares plane is that of the cells wherever σ is one.
     """
-    n, x, y, h, xx, xy, yy, xh, yh, sigma = sums
+    n, sigma = sums[0], sums[-1]
     if n <= 0:
         return np.zeros((0, 4))
+    middle, gradient, height, width, axes = _moments(sums)
+    arms = np.sqrt(2 * np.maximum(width, 0.0))[:, None] * axes.T
+    away = np.concatenate([arms, -arms])
+    each = LOCAL * sigma / n * np.sqrt(4 / n)
+    return np.column_stack([middle + away, height + away @ gradient, np.full(4, each)])
+
+
+def _moments(sums: NDArray[np.float64]) -> tuple[NDArray, NDArray, float, NDArray, NDArray]:
+    """Of a section's cells: middle (px), gradient (m per px), mean height (m), spread (px²) along their principal axes."""
+    n, x, y, h, xx, xy, yy, xh, yh, _ = sums
     middle = np.array([x, y]) / n
     spread = np.array([[xx, xy], [xy, yy]]) / n - np.outer(middle, middle)
     with_height = np.array([xh, yh]) / n - middle * (h / n)
     width, axes = np.linalg.eigh(spread)
     gradient = axes @ np.where(width > FLATTEST, axes.T @ with_height / np.maximum(width, FLATTEST), 0.0)
-    arms = np.sqrt(2 * np.maximum(width, 0.0))[:, None] * axes.T
-    away = np.concatenate([arms, -arms])
-    each = LOCAL * sigma / n * np.sqrt(4 / n)
-    return np.column_stack([middle + away, h / n + away @ gradient, np.full(4, each)])
+    return middle, gradient, h / n, width, axes

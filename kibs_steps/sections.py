@@ -357,8 +357,8 @@ def main(argv: list[str] | None = None) -> None:
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
     session = runtime.opened(model, args.provider, args.threads, args.looks)
-    networks = supposed.telling(facts, session, args.supposed)
-    views = detect(rgb, valid, tiling, block, facts.grid, networks, model.contract)
+    telling = supposed.telling(facts, args.supposed)
+    views = detect(rgb, valid, tiling, block, facts.grid, lambda core: session(telling(core)), model.contract)
     write(views, unclear(rgb, valid, views, tiling, core, facts.grid), tiling, core, args.seam_rule, args)
 
 

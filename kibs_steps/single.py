@@ -72,8 +72,10 @@ def main(argv: list[str] | None = None) -> None:
     image = raster.read(args.tiles)
     rgb, valid = image[..., :3], image[..., 3] > 0
     session = runtime.opened(model, args.provider, args.threads, args.looks)
-    networks = supposed.telling(facts, session, args.supposed)
-    views, table, heights = detect(rgb, valid, tiling, block, facts.grid, networks, model.contract)
+    telling = supposed.telling(facts, args.supposed)
+    views, table, heights = detect(
+        rgb, valid, tiling, block, facts.grid, lambda core: session(telling(core)), model.contract
+    )
     unclear = sections.unclear(rgb, valid, views, tiling, core, facts.grid)
     sections.write(views, unclear, tiling, core, args.seam_rule, args)
     store.write_table(args.corners, table)

@@ -56,7 +56,7 @@ class Supposed(NamedTuple):
 
 
 NOTHING = Supposed(None, None)
-Networks = Callable[[Window], "runtime.Network"]  # a tile's core -> the network that looks at it
+Networks = Callable[[Window], "runtime.Network"]  # a tile's core -> the network that looks at it, told where
 
 
 def directions(look: Look, view: Direction | None, sun: Direction | None, turned: float = 0.0) -> Supposed:
@@ -113,10 +113,10 @@ def told(facts: Scene, core: Window, supposed: Supposed = NOTHING) -> np.ndarray
     return runtime.geometry_vector(view and view.lean, sun and sun.lean, facts.grid.gsd)
 
 
-def telling(facts: Scene, session: Callable[[np.ndarray], runtime.Network], path: str | None) -> Networks:
-    """From a tile's core to the network that looks at it: a session of a model, told what is known there."""
+def telling(facts: Scene, path: str | None) -> Callable[[Window], np.ndarray]:
+    """From a tile's core to what networks are told of view and sun there (1, 6)."""
     supposed = read(path) if path else NOTHING
-    return lambda core: session(told(facts, core, supposed))
+    return lambda core: told(facts, core, supposed)
 
 
 def read(path: str) -> Supposed:

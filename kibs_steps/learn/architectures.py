@@ -24,7 +24,7 @@ from torch.nn import functional as F
 
 OUTPUTS = {
     "sections": ("roof", "edge", "distance", "slope", "centre"),
-    "corners": ("corner", "offset", "height"),
+    "corners": ("corner", "offset", "height", "surface"),
     "both": ("roof", "edge", "distance", "slope", "centre", "corner", "offset", "height"),
 }
 CHANNELS = {"roof": 1, "edge": 1, "distance": 1, "corner": 1, "offset": 2}  # maps at stride 1
@@ -331,6 +331,7 @@ class Dense(nn.Module):
         final = {
             "offset": lambda x: 0.5 * torch.tanh(x),
             "height": softmax,
+            "surface": softmax,
             "slope": lambda x: resized(x, 4),
             "centre": lambda x: CENTRE_UNIT * resized(x, 4),
         }

@@ -69,7 +69,8 @@ def contract_of(
     """The contract of a network trained here.
 
     `heights` are mean and standard deviation (m) of the training set's corners; `facts` replace or add fields of the
-    contract: `thresholds` (merged), `metrics`, `score`, `join`, and `seed`, `commit`, `about` (what the run was trained on).
+    contract: `thresholds` (merged), `metrics`, `score`, `join`, `walls`, and `seed`, `commit`, `about` (what the run was
+    trained on).
     """
     tile, margin = tiling(gsd)
     contract: dict[str, Any] = {
@@ -116,7 +117,7 @@ def contract_of(
             "fallback": round(mean, 2),
             "fallback_sigma": round(sigma, 2),
         }
-    contract.update({k: facts[k] for k in ("metrics", "score", "join") if k in facts})
+    contract.update({k: facts[k] for k in ("metrics", "score", "join", "walls") if k in facts})
     return contracts.validate(contract, "the new contract")
 
 
@@ -249,7 +250,7 @@ def main(argv: list[str] | None = None) -> None:
     if like:
         kept = {k: v for k, v in like["thresholds"].items() if k not in BY_SIZE or like["gsd"] == gsd}
         facts["thresholds"] = {**kept, **args.thresholds}
-        facts |= {key: like[key] for key in ("score", "join") if key in like}
+        facts |= {key: like[key] for key in ("score", "join", "walls") if key in like}
     if args.view_elevation:
         facts["about"] = {**facts["about"], "view_elevation": args.view_elevation}
     if args.commit:

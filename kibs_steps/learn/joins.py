@@ -136,7 +136,7 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
         sample = dataset.pasted_houses(ground, stock.graphs, rng, gsd=contract["gsd"])
         alike = augmentation.in_the_look(sample, stock.shown, rng)
         return sample if alike is None else alike
-    view, sun = (_direction(contract["trained_on"], name) for name in ("view", "sun"))
+    view, sun = (sources.middle(contract["trained_on"], name) for name in sources.DIRECTIONS)
     sample = dataset.simulated(
         rng,
         contract["tile"],
@@ -153,14 +153,6 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
         sample = sample._replace(rgb=augmentation.radiometry(sample.rgb, rng))
     shares = tuple(1.0 if name in stock.untold else FORGOTTEN for name in sources.DIRECTIONS)
     return augmentation.without_geometry(sample, rng, shares)
-
-
-def _direction(trained: dict[str, Any], name: str) -> tuple[float, float] | None:
-    """The middle of the directions that a model is for, azimuth and elevation in deg; None for one that is for all azimuths."""
-    azimuth, elevation = trained.get(f"{name}_azimuth"), trained.get(f"{name}_elevation")
-    if not azimuth or not elevation or azimuth[1] - azimuth[0] >= 360:
-        return None
-    return (azimuth[0] + (azimuth[1] - azimuth[0]) % 360 / 2) % 360, sum(elevation) / 2
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -34,6 +34,7 @@ DEFAULTS = {
     "leave_out": [],
     "validation": 0,
     "joins": 120,
+    "lifts": 300,
     "patience": 10,
     "shares": None,
     "thresholds": {},
@@ -53,8 +54,8 @@ ALONE = {"sections": ("sections",)}
 class Recipe(NamedTuple):
     """One `train`: the set's name, model by task -> network, models that are taken as they are by task, options of `learn.own` by
     data, of `learn.look` by scene, of `learn.training` by network, of `learn.export` by task, there of `learn.joins` too where
-    basins are joined; the weights that a network starts from, the model that the one of a task is like (no file or one), and
-    the files of the cities that tiles show."""
+    basins are joined and of `learn.lifting` where sections are lifted; the weights that a network starts from, the model that
+    the one of a task is like (no file or one), and the files of the cities that tiles show."""
 
     name: str
     network_of: dict[str, str]
@@ -64,6 +65,7 @@ class Recipe(NamedTuple):
     training: dict[str, list[str]]
     export: dict[str, list[str]]
     joins: dict[str, list[str]]
+    lifts: dict[str, list[str]]
     starts: dict[str, list[str]]
     like: dict[str, list[str]]
     cities: list[str]
@@ -178,9 +180,15 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
     for key in ("cities", "leave_out"):
         shown += [f"--{key.replace('_', '-')}", *map(str, train[key])] if train[key] else []
     shown += ["--untold", *untold] if untold else []
-    joining = [task for task in network_of if task != "corners" and train["family"] == "dense" and train["joins"]]
-    joins = {task: shown if task in joining else [] for task in network_of}
-    return Recipe(str(train["name"]), network_of, taken, own, look, training, export, joins, starts, like, cities)
+    dense = train["family"] == "dense"
+    joins = {task: shown if task != "corners" and dense and train["joins"] else [] for task in network_of}
+    lifting = [f"--tiles={train['lifts']}", *(["--cities", *map(str, train["cities"])] if train["cities"] else [])]
+    lifting += ["--untold", *untold] if untold else []
+    seen = dense and train["lifts"] and "view" not in untold  # from an unknown view nobody knows where walls are shown
+    lifts = {task: lifting if task == "corners" and seen else [] for task in network_of}
+    return Recipe(
+        str(train["name"]), network_of, taken, own, look, training, export, joins, lifts, starts, like, cities
+    )
 
 
 def of_run(config: dict[str, Any], base: Path, told: Collection[str], words: Collection[str]) -> Recipe:

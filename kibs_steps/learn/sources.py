@@ -266,6 +266,14 @@ def told(name: str, shown: list[tuple[float, float] | None]) -> dict[str, list[f
     return {f"{name}_azimuth": around, f"{name}_elevation": [float(elevation.min() - TOLD_ANGLES), high]}
 
 
+def middle(trained: dict[str, Any], name: str) -> tuple[float, float] | None:
+    """The middle of the directions that a model is for, azimuth and elevation in deg; None for one that is for all azimuths."""
+    azimuth, elevation = trained.get(f"{name}_azimuth"), trained.get(f"{name}_elevation")
+    if not azimuth or not elevation or azimuth[1] - azimuth[0] >= 360:
+        return None
+    return (azimuth[0] + (azimuth[1] - azimuth[0]) % 360 / 2) % 360, sum(elevation) / 2
+
+
 def _direction(azimuth: float | None, elevation: float | None) -> tuple[float, float] | None:
     return None if azimuth is None or elevation is None else (azimuth % 360, elevation)
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from kibs_steps import cli, store
 from kibs_steps.errors import KibsError
-from kibs_steps.models import joining, perceptron, scoring
+from kibs_steps.models import joining, perceptron, scoring, walls
 
 KEY = "kibs"
 LARGEST = 2**31 - 1  # bytes: protobuf reads no more
@@ -89,6 +89,11 @@ def validate(contract: Any, source: str) -> dict[str, Any]:
                 f"{source}: {name}: its layers do not lead from {len(traits)} traits to one number. Make it anew with "
                 "kibs_steps.learn.joins"
             )
+    if "walls" in contract and not walls.leads(contract["walls"]):
+        raise ContractMismatch(
+            f"{source}: walls: its layers do not lead from {walls.TRAITS} traits to one number. Make it anew with "
+            "kibs_steps.learn.lifting"
+        )
     lacking = [name for name in thresholds_asked(contract) if name not in contract["thresholds"]]
     if lacking:
         raise ContractMismatch(f"{source}: thresholds: {', '.join(lacking)} is not said: decoding needs it")
@@ -147,6 +152,10 @@ def load(path: str | Path, task: str | None = None) -> Model:
     except json.JSONDecodeError as error:
         raise ContractMismatch(f"{path}: the contract is not JSON ({error})") from error
     validate(contract, str(path))
+    if "walls" in contract and "surface" not in (output.name for output in proto.graph.output):
+        raise ContractMismatch(
+            f"{path}: its contract has `walls`, which need its output `surface`: export it again with that"
+        )
     if task and contract["task"] not in (task, "both"):
         raise ContractMismatch(f"{path} is a model of {contract['task']}, used here for {task}: swap the files?")
     return Model(path, hashlib.sha256(data).hexdigest(), contract)

@@ -248,3 +248,18 @@ def test_the_command_line_stands_above_a_scenes_own_keys(tmp_path):
 def test_regions_for_all_scenes_are_refused_too(tmp_path):
     with pytest.raises(BadConfig, match="has regions"):
         recipe.recipe({"regions": "r.gpkg", "scenes": {"town": TOWN}, "train": {"own": ["town"]}}, tmp_path)
+
+
+def test_walls_lift_sections_where_the_view_is_told(tmp_path):
+    scenes = {"town": TOWN, "unseen": {"raster": "t.tif", "dtm": 3}, "dark": {**TOWN, "truth": None}}
+    (tmp_path / "c.json").touch()
+    train = {"networks": "separate", "lifts": 30, "cities": [str(tmp_path / "c.json")]}
+    found = recipe.recipe({"train": train}, tmp_path)
+    assert found.lifts == {"sections": [], "corners": ["--tiles=30", "--cities", str(tmp_path / "c.json")]}
+    assert recipe.recipe({"scenes": scenes, "train": {"scene": "dark"}}, tmp_path).lifts["corners"] == [
+        "--tiles=300",
+        "--untold",
+        "sun",
+    ]
+    for nothing in ({"lifts": 0}, {"family": "maskrcnn"}, {"scene": "unseen"}):
+        assert not any(recipe.recipe({"scenes": scenes, "train": {**train, **nothing}}, tmp_path).lifts.values())

@@ -49,7 +49,16 @@ def test_train_on_own_data_then_build_another_raster(tmp_path):
         size = [f"--seed={seed}", "--size=340", "--style=suburb", f"--out={tmp_path / name}"]
         simulation.main([*size, *angles])
     scene = {"raster": "known/scene.tif", "dtm": "known/dtm.tif", "truth": "known/truth.gpkg", **ANGLES}
-    train = {"name": "town", "own": ["known"], "split": "shuffle", "tiles": 0, "steps": 20, "minutes": 30, "joins": 2}
+    train = {
+        "name": "town",
+        "own": ["known"],
+        "split": "shuffle",
+        "tiles": 0,
+        "steps": 20,
+        "minutes": 30,
+        "joins": 2,
+        "lifts": 2,
+    }
     train |= {"scene": "known", "thresholds": {"surer": 0.7}}
     # A scene's models are looked for when Snakemake starts, so the configuration of training names the shipped ones.
     (tmp_path / "config.yaml").write_text(json.dumps({"scenes": {"known": scene}, "train": train}))

@@ -87,7 +87,7 @@ rule trained:
 
 
 rule exported:
-    """Export a trained network as the ONNX model of one task, with its contract and how basins are joined to sections."""
+    """Export a trained network as the ONNX model of one task; teach it how basins are joined, or how walls lift sections."""
     input:
         done=lambda w: f"runs/{w.name}/{RECIPE.network_of[w.task]}/done.json",
         look=[f"runs/{RECIPE.name}/look/{scene}.npy" for scene in RECIPE.look],
@@ -106,13 +106,18 @@ rule exported:
         options=lambda w: RECIPE.export[w.task],
         like=lambda w, input: ["--like", *input.like] if input.like else [],
         joins=lambda w: RECIPE.joins[w.task],
-        learns=lambda w: "yes" if RECIPE.joins[w.task] else "no",
+        joined=lambda w: "yes" if RECIPE.joins[w.task] else "no",
+        lifts=lambda w: RECIPE.lifts[w.task],
+        lifted=lambda w: "yes" if RECIPE.lifts[w.task] else "no",
+        pool=lambda w: ["--pool", f"runs/{w.name}/pool"] if TRAIN["tiles"] else [],
         look=lambda w, input: ["--look", *input.look] if input.look else [],
     shell:
         "python -m kibs_steps.learn.export {params.options:q} {params.like:q} --checkpoint $(dirname {input.done:q})/checkpoint.pt"
         " --task {wildcards.task} --pool runs/{wildcards.name:q}/pool --out {output:q} > {log:q} 2>&1"
-        " && (test {params.learns} = no"
+        " && (test {params.joined} = no"
         " || python -m kibs_steps.learn.joins --model {output:q} {params.joins:q} {params.look:q} >> {log:q} 2>&1)"
+        " && (test {params.lifted} = no"
+        " || python -m kibs_steps.learn.lifting --model {output:q} {params.pool:q} {params.lifts:q} {params.look:q} >> {log:q} 2>&1)"
 
 
 rule taken:

@@ -1,0 +1,258 @@
+"""Walls: how high a whole section stands, by the walls and shadows seen beside it.
+
+The height map of a 3D model tells how heights differ within a section better than how high all of it stands: most of its error
+is one number per section. So every section is lifted by a row of **offsets**. From a pixel of its rim that faces the satellite
+at height h, its base is shown at P − v·(h + offset), and from one that throws a shadow the tip at P + (s − v)·(h + offset), v
+and s being the leans of view and sun in the image. What is seen at these places and on the way there (walls, ground, shade,
+other roofs and how high those are), on average over the rim, and what the height map says of such a lift, are the **traits** of
+an offset; the contract's `walls`, a small network of convolutions along the offsets, tells from them how likely each is.
+Neighbouring sections err alike, so half of a section's lift is that of it and its neighbours together.
+
+In: sections as labels, the outputs `surface` and `height` of a dense 3D model. Out: metres to lift each section.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kibs_steps import heightmap
+
+OFFSETS = np.arange(-12.0, 12.25, 0.5)  # m
+STEP = 0.5  # m between them, and between looks along a ray
+HIGHEST = 48.0  # m: how far down a wall, or along a shadow, is looked
+KINDS = 5  # of surface: ground, roof, wall, other, shaded ground
+GROUND, ROOF, WALL, OTHER, SHADE = range(KINDS)
+SEEN = KINDS + 4  # traits of a direction: kinds, the section itself, roofs' heights, a wall's end on ground, on a roof
+TRAITS = 2 * SEEN + 4
+WHOLE = 9  # traits of a section
+OUTWARD = 1.5  # px from a rim's pixel to what lies beyond it
+LEAST = 24  # px of a section that is looked at
+LEANING = 0.25  # px per metre: what leans less shows no wall
+ROUND = 2  # px about a corner whose sections it goes with
+NEAR = 2  # px: sections no farther apart are neighbours
+SURE = (0.02, 0.98)  # probabilities of a wall, so that no look is the last word
+
+
+class Traits(NamedTuple):
+    """Of sections (n) `labels`: `along` (n, TRAITS, offsets) and `whole` (n, WHOLE), their areas (px), and `height` (s, s), that
+    of their planes (m; 0 elsewhere)."""
+
+    labels: NDArray[np.int64]
+    along: NDArray[np.float32]
+    whole: NDArray[np.float32]
+    area: NDArray[np.int64]
+    height: NDArray[np.float32]
+
+
+def traits(
+    labels: NDArray, surface: NDArray, distribution: NDArray, heights: dict[str, Any], geometry: NDArray
+) -> Traits:
+    """Traits of the sections of a tile: `labels` (s, s), 0 none, `surface` (KINDS, s/k, s/k) probabilities, `distribution`
+    (B, s/l, s/l) over the bins of `heights` (the contract's), `geometry` (6,) as networks are told it."""
+    side = len(labels)
+    area = np.bincount(labels.ravel())
+    centres = np.asarray(heights["centres"], float)
+    mean = np.tensordot(centres, distribution, (0, 0))
+    spread = np.sqrt(np.maximum(np.tensordot(centres**2, distribution, (0, 0)) - mean**2, 0.0))
+    found, sums = heightmap.sums_by_label(labels, mean, spread, 0.0, 0.0)
+    known = area[found] >= LEAST
+    found, sums = found[known], sums[known]
+    if not len(found):
+        none = np.zeros((0, TRAITS, len(OFFSETS)), np.float32), np.zeros((0, WHOLE), np.float32)
+        return Traits(found, *none, found, np.zeros(labels.shape, np.float32))
+    number = np.full(len(area), -1)
+    number[found] = np.arange(len(found))
+    of = number[labels]
+    planes = np.array([heightmap.plane(row) for row in sums])
+    row, col = np.mgrid[:side, :side] + 0.5
+    a, b, c = np.moveaxis(planes[of], -1, 0)
+    height = np.where(of >= 0, a * col + b * row + c, 0.0).astype(np.float32)
+    tile = _Tile(labels, of, height, surface, len(found))
+    view, sun = geometry[:2].astype(float), geometry[2:4].astype(float)
+    told_view, told_sun = geometry[4] > 0, geometry[4] > 0 and geometry[5] > 0
+    base, facing = _along(tile, -view, told_view, np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
+    tip, shading = _along(tile, sun - view, told_sun, np.array([0.0, 0.5, 0.5, 0.0, 1.0]))
+    own = _own(labels, number, height, distribution, np.asarray(heights["edges"], float), len(found))
+    middle = np.bincount(of[of >= 0], height[of >= 0], len(found)) / np.bincount(of[of >= 0], minlength=len(found))
+    offsets = np.broadcast_to(OFFSETS, (len(found), len(OFFSETS)))
+    along = [base, tip, own, offsets[:, None] / 10, (middle[:, None] + offsets)[:, None] / 20]
+    size = np.sqrt(area[found])
+    ones = np.ones(len(found))
+    whole = [
+        np.log(area[found]) / 5 - 1, facing / size, shading / size, middle / 10 - 1,
+        np.log(sums[:, -1] / np.maximum(sums[:, 0], 1e-9) + 0.1),
+        ones * told_view * np.hypot(*view) / 2, ones * told_sun * np.hypot(*(sun - view)) / 2, ones * told_view,
+        ones * (geometry[5] > 0),
+    ]  # fmt: skip
+    found_along = np.concatenate(along, axis=1, dtype=np.float32)
+    return Traits(found, found_along, np.stack(whole, axis=1).astype(np.float32), area[found], height)
+
+
+class _Tile(NamedTuple):
+    """A tile's sections: labels, their numbers (−1 none), heights (m) of those, what is seen, how many there are."""
+
+    labels: NDArray
+    of: NDArray
+    height: NDArray
+    surface: NDArray
+    count: int
+
+
+def _along(tile: _Tile, away: NDArray, told: bool, stays: NDArray) -> tuple[NDArray, NDArray]:
+    """Traits (n, SEEN, offsets) of what is seen `away` (px per metre of height) from rims that face there, and how many pixels
+    these rims have; `stays` tells what a ray that goes on is taken to see, kind by kind."""
+    found, count = np.zeros((tile.count, SEEN, len(OFFSETS)), np.float32), np.zeros(tile.count)
+    length = float(np.hypot(*away))
+    side = len(tile.labels)
+    if not told or length < LEANING:
+        return found, count
+    out = np.rint(away / length * OUTWARD).astype(int)
+    beyond = np.pad(tile.labels, 2, constant_values=-1)[2 + out[1] : side + 2 + out[1], 2 + out[0] : side + 2 + out[0]]
+    row, col = np.nonzero((tile.of >= 0) & (beyond != tile.labels) & (beyond >= 0))
+    if not len(row):
+        return found, count
+    mine, height = tile.of[row, col], tile.height[row, col]
+
+    def seen(metres: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Kinds of surface, roofs' heights, whether the place is in the tile, x and y of places so far away (m)."""
+        x, y = col[:, None] + 0.5 + away[0] * metres, row[:, None] + 0.5 + away[1] * metres
+        inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+        stride = side / tile.surface.shape[1]
+        kinds = np.stack([_read(kind, x / stride, y / stride) for kind in tile.surface])
+        roofs = _read(tile.height, x, y)
+        same = (
+            tile.labels[np.clip(y.astype(int), 0, side - 1), np.clip(x.astype(int), 0, side - 1)]
+            == tile.labels[row, col][:, None]
+        )
+        return kinds, roofs, inside, same
+
+    metres = height[:, None] + OFFSETS
+    kinds, roofs, inside, same = seen(metres)
+    there = inside & (metres > 0)
+    direct = np.concatenate([kinds * there, (same & there)[None], (roofs * there / 10)[None]])
+    for k, values in enumerate(direct):
+        np.add.at(found[:, k], mine, values)
+    ray = np.broadcast_to(np.arange(STEP / 2, HIGHEST, STEP), (len(row), int(HIGHEST / STEP)))
+    kinds, roofs, inside, same = seen(ray)
+    on = np.clip(np.tensordot(stays, kinds, (0, 0)), *SURE)
+    on = np.where(inside & ~same & (ray * length > OUTWARD), on, 1.0)  # the rim itself is roof
+    reached = np.cumprod(np.concatenate([np.ones((len(row), 1)), on[:, :-1]], axis=1), axis=1)
+    ends = reached * (1 - on)
+    for k, (share, foot) in enumerate(((ends * (1 - kinds[ROOF]), 0.0), (ends * kinds[ROOF], roofs))):
+        at = np.rint((ray + foot - height[:, None] - OFFSETS[0]) / STEP).astype(int)
+        good = (at >= 0) & (at < len(OFFSETS))
+        np.add.at(found[:, KINDS + 2 + k], (np.broadcast_to(mine[:, None], at.shape)[good], at[good]), share[good])
+    count = np.bincount(mine, minlength=tile.count).astype(float)
+    return found / np.maximum(count, 1)[:, None, None], count
+
+
+def _read(image: NDArray, x: NDArray, y: NDArray) -> NDArray:
+    """Bilinear values of an image (h, w) at places (pixels, corners at whole numbers); 0 beyond it."""
+    place = (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
+    return cv2.remap(image.astype(np.float32), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def _own(
+    labels: NDArray, number: NDArray, height: NDArray, distribution: NDArray, edges: NDArray, count: int
+) -> NDArray:
+    """What the height map says of each offset (n, 2, offsets): mean density (1/m) over a section's cells, and of its log."""
+    label = heightmap.cells_of(labels, len(labels) // distribution.shape[1])[
+        : distribution.shape[1], : distribution.shape[2]
+    ]
+    row, col = np.nonzero(number[label] >= 0)
+    mine = number[label[row, col]]
+    plane = heightmap.cells_of(height, len(labels) // distribution.shape[1])[row, col]
+    metres = plane[:, None] + OFFSETS
+    at = np.clip(np.searchsorted(edges, metres, side="right") - 1, 0, len(edges) - 2)
+    density = np.take_along_axis((distribution[:, row, col] / np.diff(edges)[:, None]).T, at, axis=1)
+    density = np.where((metres >= 0) & (metres <= edges[-1]), density, 0.0)
+    found = np.zeros((count, 2, len(OFFSETS)))
+    np.add.at(found[:, 0], mine, density)
+    np.add.at(found[:, 1], mine, np.log(density + 1e-3) / 5)
+    return found / np.maximum(np.bincount(mine, minlength=count), 1)[:, None, None]
+
+
+def likely(seen: Traits, terms: dict[str, Any]) -> NDArray[np.float64]:
+    """How likely each offset is (n, offsets): convolutions over five offsets with ReLU between, the first told the section's
+    own traits, each but the first and the last added to what it sees; then their share."""
+    first, *inner, last = terms["layers"]
+    x = np.maximum(
+        _convolved(seen.along, first) + (seen.whole @ np.asarray(terms["whole"]) + terms["bias"])[:, None], 0
+    )
+    for layer in inner:
+        x = np.maximum(x + _convolved(x.transpose(0, 2, 1), layer), 0)
+    score = _convolved(x.transpose(0, 2, 1), last)[..., 0]
+    risen = np.exp(score - score.max(axis=1, keepdims=True))
+    return risen / risen.sum(axis=1, keepdims=True)
+
+
+def _convolved(x: NDArray, layer: dict[str, Any]) -> NDArray:
+    """(n, offsets, out) of x (n, in, offsets), zero beyond the ends; `weights` (5·in, out), offset after offset."""
+    padded = np.pad(x, ((0, 0), (0, 0), (2, 2)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=2)  # n, in, offsets, 5
+    flat = windows.transpose(0, 2, 3, 1).reshape(len(x), x.shape[2], -1)
+    return flat @ np.asarray(layer["weights"]) + layer["bias"]
+
+
+def leads(terms: dict[str, Any]) -> bool:
+    """Whether terms lead from these traits to one number, each layer taking what the one before gives."""
+    wide = len(terms["bias"])
+    rows = [5 * TRAITS, *[5 * wide] * (len(terms["layers"]) - 1)]
+    widths = [*[wide] * (len(terms["layers"]) - 1), 1]
+    return np.shape(terms["whole"]) == (WHOLE, wide) and all(
+        np.shape(layer["weights"]) == (row, width) and len(layer["bias"]) == width
+        for layer, row, width in zip(terms["layers"], rows, widths, strict=True)
+    )
+
+
+def lifts(labels: NDArray, seen: Traits, terms: dict[str, Any]) -> NDArray[np.float64]:
+    """Metres to lift each label (0 … labels.max()) of a tile; 0 where nothing was looked at."""
+    found = np.zeros(int(labels.max(initial=0)) + 1)
+    if not len(seen.labels):
+        return found
+    found[seen.labels] = medians(likely(seen, terms))
+    area = np.zeros(len(found))
+    area[seen.labels] = seen.area
+    pairs = neighbours(labels)
+    pairs = pairs[(area[pairs] > 0).all(axis=1)]
+    total, weight = area * found, area.copy()
+    for one, other in (pairs.T, pairs.T[::-1]):
+        np.add.at(total, one, area[other] * found[other])
+        np.add.at(weight, one, area[other])
+    return (found + total / np.maximum(weight, 1)) / 2
+
+
+def about(labels: NDArray, lift: NDArray, col: NDArray, row: NDArray) -> NDArray[np.float64]:
+    """The mean lift (m) of the sections within `ROUND` px of places (px), by their pixels; 0 where there are none."""
+    side = len(labels)
+    total, count = np.zeros(len(col)), np.zeros(len(col))
+    for down in range(-ROUND, ROUND + 1):
+        for right in range(-ROUND, ROUND + 1):
+            y, x = np.floor(row).astype(int) + down, np.floor(col).astype(int) + right
+            label = labels[np.clip(y, 0, side - 1), np.clip(x, 0, side - 1)]
+            total += np.where(label > 0, lift[label], 0.0)
+            count += label > 0
+    return total / np.maximum(count, 1)
+
+
+def medians(shares: NDArray) -> NDArray[np.float64]:
+    """The offset (n,) at which half of the shares (n, offsets) is reached, each spread over its step."""
+    below = np.cumsum(shares, axis=1)
+    at = np.argmax(below >= 0.5 * below[:, -1:], axis=1)[:, None]
+    own = np.take_along_axis(shares, at, axis=1)[:, 0]
+    before = np.take_along_axis(below, at, axis=1)[:, 0] - own
+    return OFFSETS[at[:, 0]] - STEP / 2 + STEP * (0.5 * below[:, -1] - before) / np.maximum(own, 1e-12)
+
+
+def neighbours(labels: NDArray) -> NDArray[np.int64]:
+    """Pairs (m, 2) of labels that lie at most `NEAR` px apart along rows or columns, each once."""
+    found = [np.zeros((0, 2), np.int64)]
+    for apart in range(1, NEAR + 1):
+        for one, other in ((labels[apart:], labels[:-apart]), (labels[:, apart:], labels[:, :-apart])):
+            both = (one > 0) & (other > 0) & (one != other)
+            found.append(np.sort(np.stack([one[both], other[both]], axis=1).astype(np.int64), axis=1))
+    return np.unique(np.concatenate(found), axis=0)
