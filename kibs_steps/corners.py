@@ -122,7 +122,7 @@ def main(argv: list[str] | None = None) -> None:
         geometry = telling(tile.core)
         outputs = session(geometry)(images[place])
         found, shown = heads.decode_corners(outputs, model.contract), heads.height_map(outputs, model.contract)
-        if "walls" in model.contract and geometry[0, 4]:  # from an unknown view nobody knows where a base is shown
+        if "walls" in model.contract and runtime.leans(geometry[0]):  # from above, or nobody knows where, no wall shows
             found, shown = lifted(found, shown, outputs, labels[place], geometry[0], model.contract)
         tables.append(of_tile(found, tile, tiling))
         heights.append(heights_of_tile(shown, labels[place], tile, tiling))

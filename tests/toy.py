@@ -154,6 +154,17 @@ def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> P
     return save(*corner_parts(bias), path, contract("corners") if terms is None else terms)
 
 
+def walled_corners_model(path: Path, walls: dict, bias: float = 0.0) -> Path:
+    """The same corners by a model that has `walls` in its contract, and sees ground everywhere."""
+    nodes, constants, outputs = corner_parts(bias)
+    nodes.append(helper.make_node("Identity", ["ground"], ["surface"]))
+    shape = [1, 5, TILE // 2, TILE // 2]
+    ground = np.zeros(shape, np.float32)
+    ground[:, 0] = 1
+    terms = contract("corners", walls=walls)
+    return save(nodes, {**constants, "ground": ground}, {**outputs, "surface": shape}, path, terms)
+
+
 def both_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> Path:
     """One model that gives what the two give."""
     nodes, constants, outputs = section_parts()

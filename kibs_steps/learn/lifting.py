@@ -146,16 +146,16 @@ def learned(lesson: Lesson, rounds: int = ROUNDS) -> dict[str, Any]:
 def tiles(
     pool: str | None, count: int, contract: dict[str, Any], cities: Sequence[citymodel.CityModel]
 ) -> Iterator[Sample]:
-    """So many tiles with heights, seen from a known view: of a pool, or simulated, seen and lit as the contract says; every
+    """At most so many tiles in which roofs lean, as is known: of a pool, or simulated, seen and lit as the contract says; every
     third of these shows tall buildings."""
     if pool:
         files = sorted(Path(pool).glob("[!.]*.npz"))
         chosen = (Sample.load(files[i]) for i in np.random.default_rng(SEED).permutation(len(files)))
-        yield from islice((sample for sample in chosen if sample.geometry[4]), count)
+        yield from islice((sample for sample in chosen if runtime.leans(sample.geometry)), count)
         return
     view, sun = (sources.middle(contract["trained_on"], name) for name in sources.DIRECTIONS)
     for number in range(count):
-        yield dataset.simulated(
+        sample = dataset.simulated(
             np.random.default_rng([SEED, number]),
             contract["tile"],
             view=view,
@@ -164,6 +164,8 @@ def tiles(
             gsd=contract["gsd"],
             tall=number % sources.TALL_EVERY == sources.TALL_EVERY - 1,
         )
+        if runtime.leans(sample.geometry):
+            yield sample
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import toy
 
-from kibs_steps import corners, view
-from kibs_steps.models import heads, walls
+from kibs_steps import corners, raster, scene, store, view
+from kibs_steps.models import contract, heads, walls
 
 SIDE, GSD = 192, 0.38
 EDGES = np.arange(0.0, 31.0)
@@ -117,11 +118,11 @@ def test_a_section_is_lifted_and_its_corners_and_neighbours_with_it():
     """Neighbours err alike: two halves of one roof are lifted alike."""
     told = geometry(180.0, 55.0)
     labels, surface, distribution = house(9.0, 6.5, told)
-    contract = {"heights": HEIGHTS, "walls": by_walls()}
+    terms = {"heights": HEIGHTS, "walls": by_walls()}
     outputs = {"surface": surface, "height": distribution}
     shown = np.full((48, 48), 6.5), np.ones((48, 48))
     found = heads.Corners(np.array([80.4, 20.0]), np.array([80.4, 20.0]), np.array([6.5, 3.0]), np.ones(2), np.ones(2))
-    moved, (mean, sigma) = corners.lifted(found, shown, outputs, 7 * labels, told, contract)
+    moved, (mean, sigma) = corners.lifted(found, shown, outputs, 7 * labels, told, terms)
     assert mean[25, 25] == pytest.approx(9.0, abs=1.25)
     assert mean[0, 0] == 6.5
     assert moved.height[0] == pytest.approx(mean[25, 25])
@@ -138,3 +139,34 @@ def test_medians_lie_where_half_of_the_shares_are():
     shares[1, [10, 11]] = 0.5
     shares[2, 20], shares[2, 30] = 0.75, 0.25
     assert walls.medians(shares) == pytest.approx([0.0, -6.75, -2.0 + 0.5 * (0.5 / 0.75) - 0.25])
+
+
+def by(metres):
+    """Terms that lift by so many metres, whatever is seen."""
+    first = np.zeros((5, walls.TRAITS, 2))
+    first[2, walls.TRAITS - 2] = 10, -10  # the trait that is the offset itself, in 10 m
+    layers = [(first, [-metres, metres]), (np.r_[[[[0], [0]]] * 2, [[[-9], [-9]]], [[[0], [0]]] * 2], [0.0])]
+    told = [{"weights": w.reshape(-1, w.shape[2]).tolist(), "bias": bias} for w, bias in layers]
+    return {"layers": told, "whole": np.zeros((walls.WHOLE, 2)).tolist(), "bias": [0.0, 0.0]}
+
+
+@pytest.mark.parametrize(("angles", "lift"), [((181.1, 59.3), 3.0), ((181.1, 88.0), 0.0), (None, 0.0)])
+def test_the_step_lifts_where_roofs_are_known_to_lean(tmp_path, angles, lift):
+    image = toy.paint([(20, 20, 20, 16, 80, (8.0, 8.0, 8.0, 8.0))], toy.TILE, toy.TILE)
+    raster.write(tmp_path / "blended.tif", image)
+    raster.write(tmp_path / "labels.tif", (image[..., 0] != 90).astype(np.uint32) * 5)
+    told = [f"--view-azimuth={angles[0]}", f"--view-elevation={angles[1]}"] if angles else []
+    picture = toy.raster(tmp_path / "town.tif", image)
+    scene.main(["--name=t", f"--raster={picture}", "--dtm=50", "--gsd=0.38", f"--out={tmp_path / 'scene.json'}", *told])
+    heights = {}
+    for name, terms in (("plain", by(0.0)), ("lifted", by(3.0))):
+        model = contract.load(toy.walled_corners_model(tmp_path / f"{name}.onnx", terms), "corners")
+        record = {"file": str(model.path), "sha256": model.sha256, "contract": model.contract}
+        store.write_json(tmp_path / f"{name}.json", record)
+        files = [f"--{key}={tmp_path / f'{key}.tif'}" for key in ("blended", "labels")]
+        files += [f"--scene={tmp_path / 'scene.json'}", f"--model={tmp_path / f'{name}.json'}"]
+        out = [f"--out={tmp_path / f'{name}.parquet'}", f"--heights={tmp_path / f'{name}_heights.parquet'}"]
+        corners.main([*files, *out, "--name=r0c0", "--margin=8", "--block=1"])
+        heights[name] = store.read_table(tmp_path / f"{name}.parquet")["height"].to_numpy()
+    assert len(heights["plain"]) == 4
+    assert heights["lifted"] - heights["plain"] == pytest.approx([lift] * 4, abs=0.3)
