@@ -35,6 +35,7 @@ LEANING = 0.25  # px per metre: what leans less shows no wall
 ROUND = 2  # px about a corner whose sections it goes with
 NEAR = 2  # px: sections no farther apart are neighbours
 SURE = (0.02, 0.98)  # probabilities of a wall, so that no look is the last word
+MOST = 16384  # looks of a kind at a time; OpenCV takes rows up to 32,767
 
 
 class Traits(NamedTuple):
@@ -71,7 +72,7 @@ def traits(
     row, col = np.mgrid[:side, :side] + 0.5
     a, b, c = np.moveaxis(planes[of], -1, 0)
     height = np.where(of >= 0, a * col + b * row + c, 0.0).astype(np.float32)
-    tile = _Tile(labels, of, height, surface, len(found))
+    tile = _Tile(labels, of, height, np.ascontiguousarray(surface, np.float32), len(found))
     view, sun = geometry[:2].astype(float), geometry[2:4].astype(float)
     told_view, told_sun = geometry[4] > 0, geometry[4] > 0 and geometry[5] > 0
     base, facing = _along(tile, -view, told_view, np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
@@ -115,45 +116,57 @@ def _along(tile: _Tile, away: NDArray, told: bool, stays: NDArray) -> tuple[NDAr
     row, col = np.nonzero((tile.of >= 0) & (beyond != tile.labels) & (beyond >= 0))
     if not len(row):
         return found, count
-    mine, height = tile.of[row, col], tile.height[row, col]
-
-    def seen(metres: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Kinds of surface, roofs' heights, whether the place is in the tile, x and y of places so far away (m)."""
-        x, y = col[:, None] + 0.5 + away[0] * metres, row[:, None] + 0.5 + away[1] * metres
-        inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-        stride = side / tile.surface.shape[1]
-        kinds = np.stack([_read(kind, x / stride, y / stride) for kind in tile.surface])
-        roofs = _read(tile.height, x, y)
-        same = (
-            tile.labels[np.clip(y.astype(int), 0, side - 1), np.clip(x.astype(int), 0, side - 1)]
-            == tile.labels[row, col][:, None]
-        )
-        return kinds, roofs, inside, same
-
-    metres = height[:, None] + OFFSETS
-    kinds, roofs, inside, same = seen(metres)
-    there = inside & (metres > 0)
-    direct = np.concatenate([kinds * there, (same & there)[None], (roofs * there / 10)[None]])
-    for k, values in enumerate(direct):
-        np.add.at(found[:, k], mine, values)
-    ray = np.broadcast_to(np.arange(STEP / 2, HIGHEST, STEP), (len(row), int(HIGHEST / STEP)))
-    kinds, roofs, inside, same = seen(ray)
-    on = np.clip(np.tensordot(stays, kinds, (0, 0)), *SURE)
-    on = np.where(inside & ~same & (ray * length > OUTWARD), on, 1.0)  # the rim itself is roof
-    reached = np.cumprod(np.concatenate([np.ones((len(row), 1)), on[:, :-1]], axis=1), axis=1)
-    ends = reached * (1 - on)
-    for k, (share, foot) in enumerate(((ends * (1 - kinds[ROOF]), 0.0), (ends * kinds[ROOF], roofs))):
-        at = np.rint((ray + foot - height[:, None] - OFFSETS[0]) / STEP).astype(int)
-        good = (at >= 0) & (at < len(OFFSETS))
-        np.add.at(found[:, KINDS + 2 + k], (np.broadcast_to(mine[:, None], at.shape)[good], at[good]), share[good])
-    count = np.bincount(mine, minlength=tile.count).astype(float)
+    order = np.argsort(tile.of[row, col], kind="stable")
+    for first in range(0, len(order), MOST):
+        part = order[first : first + MOST]
+        _look(tile, col[part], row[part], away, stays, found)
+    count = np.bincount(tile.of[row, col], minlength=tile.count).astype(float)
     return found / np.maximum(count, 1)[:, None, None], count
 
 
-def _read(image: NDArray, x: NDArray, y: NDArray) -> NDArray:
-    """Bilinear values of an image (h, w) at places (pixels, corners at whole numbers); 0 beyond it."""
-    place = (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
-    return cv2.remap(image.astype(np.float32), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+def _look(tile: _Tile, col: NDArray, row: NDArray, away: NDArray, stays: NDArray, found: NDArray) -> None:
+    """Add to `found` (n, SEEN, offsets) what is seen from pixels (m,) of rims, section by section."""
+    side, stride = len(tile.labels), len(tile.labels) / tile.surface.shape[1]
+    mine, height = tile.of[row, col], tile.height[row, col]
+    changes = np.flatnonzero(np.diff(mine, prepend=-1))
+
+    def seen(metres: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Kinds of surface, roofs' heights, whether a place so far away (m) is in the tile, and in the section itself."""
+        x, y = (
+            (px[:, None] + 0.5 + lean * metres).astype(np.float32) for px, lean in zip((col, row), away, strict=True)
+        )
+        inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+        kinds = _read(tile.surface, x / np.float32(stride), y / np.float32(stride))
+        roofs = _read(tile.height[None], x, y)[0]
+        own = tile.of[np.clip(y.astype(int), 0, side - 1), np.clip(x.astype(int), 0, side - 1)] == mine[:, None]
+        return kinds, roofs, inside, own
+
+    metres = height[:, None] + OFFSETS
+    kinds, roofs, inside, own = seen(metres)
+    there = inside & (metres > 0)
+    for k, values in enumerate((*kinds, own, roofs / 10)):
+        found[mine[changes], k] += np.add.reduceat(values * there, changes, axis=0)
+    ray = np.broadcast_to(np.arange(STEP / 2, HIGHEST, STEP), (len(row), int(HIGHEST / STEP)))
+    kinds, roofs, inside, own = seen(ray)
+    on = np.clip(np.tensordot(stays, kinds, (0, 0)), *SURE)
+    on = np.where(inside & ~own & (ray * np.hypot(*away) > OUTWARD), on, 1.0)  # the rim itself is roof
+    ends = 1 - on
+    ends[:, 1:] *= np.cumprod(on[:, :-1], axis=1)
+    for k, (share, foot) in enumerate(((ends * (1 - kinds[ROOF]), 0.0), (ends * kinds[ROOF], roofs))):
+        at = np.rint((ray + foot - height[:, None] - OFFSETS[0]) / STEP).astype(int)
+        good = (at >= 0) & (at < len(OFFSETS))
+        flat = (mine[:, None] * len(OFFSETS) + at)[good]
+        found[:, KINDS + 2 + k] += np.bincount(flat, share[good], tile.count * len(OFFSETS)).reshape(tile.count, -1)
+
+
+def _read(images: NDArray, x: NDArray, y: NDArray) -> NDArray:
+    """Bilinear values (k, …) of images (k, h, w) at places (pixels, corners at whole numbers); 0 beyond them."""
+    half = np.float32(0.5)
+    read = (
+        cv2.remap(image, x - half, y - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        for image in images
+    )
+    return np.stack(list(read))
 
 
 def _own(
@@ -181,11 +194,13 @@ def likely(seen: Traits, terms: dict[str, Any]) -> NDArray[np.float64]:
     own traits, each but the first and the last added to what it sees; then their share."""
     first, *inner, last = terms["layers"]
     x = np.maximum(
-        _convolved(seen.along, first) + (seen.whole @ np.asarray(terms["whole"]) + terms["bias"])[:, None], 0
+        _convolved(seen.along, first)
+        + (seen.whole @ np.asarray(terms["whole"], np.float32) + np.float32(terms["bias"]))[:, None],
+        0,
     )
     for layer in inner:
         x = np.maximum(x + _convolved(x.transpose(0, 2, 1), layer), 0)
-    score = _convolved(x.transpose(0, 2, 1), last)[..., 0]
+    score = _convolved(x.transpose(0, 2, 1), last)[..., 0].astype(float)
     risen = np.exp(score - score.max(axis=1, keepdims=True))
     return risen / risen.sum(axis=1, keepdims=True)
 
@@ -195,7 +210,7 @@ def _convolved(x: NDArray, layer: dict[str, Any]) -> NDArray:
     padded = np.pad(x, ((0, 0), (0, 0), (2, 2)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=2)  # n, in, offsets, 5
     flat = windows.transpose(0, 2, 3, 1).reshape(len(x), x.shape[2], -1)
-    return flat @ np.asarray(layer["weights"]) + layer["bias"]
+    return flat @ np.asarray(layer["weights"], np.float32) + np.asarray(layer["bias"], np.float32)
 
 
 def leads(terms: dict[str, Any]) -> bool:
