@@ -54,38 +54,41 @@ def of_tile(found: heads.Corners, tile: Tile, tiling: Tiling) -> pa.Table:
 
 
 def heights_of_tile(
-    found: tuple[np.ndarray, np.ndarray] | None, labels: np.ndarray, tile: Tile, tiling: Tiling
+    found: tuple[np.ndarray, np.ndarray] | None,
+    labels: np.ndarray,
+    tile: Tile,
+    tiling: Tiling,
+    lifted: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> pa.Table:
-    """Sums of a tile's height map (`heads.height_map`) over each label (s, s) in the tile's core."""
+    """Sums of a tile's height map (`heads.height_map`) over each label (s, s) in the tile's core, and of its `lifts`."""
     if found is None:
         return heightmap.HEIGHTS.empty_table()
     p, window = tiling.margin, tiling.window(tile)
     core = np.zeros_like(labels)
     inside = np.s_[p : p + tile.core.height, p : p + tile.core.width]
     core[inside] = labels[inside]
-    return heightmap.table(*heightmap.sums_by_label(core, *found, window.col, window.row))
+    known, sums = heightmap.sums_by_label(core, *found, window.col, window.row)
+    if lifted is not None and len(known):
+        lift, looks = (of[known - _before(labels)] for of in lifted)
+        sums[:, heightmap.LIFT], sums[:, heightmap.LOOKS] = lift * looks, looks
+    return heightmap.table(known, sums)
 
 
-def lifted(
-    found: heads.Corners,
-    shown: tuple[np.ndarray, np.ndarray],
-    outputs: dict[str, np.ndarray],
-    labels: np.ndarray,
-    geometry: np.ndarray,
-    contract: dict,
-) -> tuple[heads.Corners, tuple[np.ndarray, np.ndarray]]:
-    """Corners and height map of a tile with each section lifted as its walls and shadows say (`models.walls`); a corner goes with
-    the sections round it."""
+def lifts(
+    outputs: dict[str, np.ndarray], labels: np.ndarray, geometry: np.ndarray, contract: dict
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far (m) walls and shadows lift the sections of a tile, and how much of them is seen (`models.walls`); the first is no
+    section, then follow the tile's labels (s, s) in their order. `geometry` (6,)."""
     from kibs_steps.models import walls
 
-    before = int(labels[labels > 0].min()) - 1
-    numbers = np.where(labels > 0, labels.astype(np.int64) - before, 0)  # those of a tile follow each other
+    numbers = np.where(labels > 0, labels.astype(np.int64) - _before(labels), 0)
     seen = walls.traits(numbers, outputs["surface"], outputs["height"], contract["heights"], geometry)
-    lift = walls.lifts(numbers, seen, contract["walls"])
-    mean, sigma = shown
-    cells = heightmap.cells_of(numbers, len(numbers) // len(mean))[: mean.shape[0], : mean.shape[1]]
-    height = found.height + walls.about(numbers, lift, found.col, found.row)
-    return found._replace(height=np.maximum(height, 0.0)), (np.maximum(mean + lift[cells], 0.0), sigma)
+    return walls.lifts(numbers, seen, contract["walls"]), walls.looks(numbers, seen)
+
+
+def _before(labels: np.ndarray) -> int:
+    """The label before the first of a tile: they follow each other."""
+    return int(labels[labels > 0].min()) - 1
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -119,13 +122,14 @@ def main(argv: list[str] | None = None) -> None:
         place = tile.row, tile.col
         if not labels[place].any():
             continue  # no section is near that could take its corners
-        geometry = telling(tile.core)
+        geometry = runtime.told(model, telling(tile.core))
         outputs = session(geometry)(images[place])
-        found, shown = heads.decode_corners(outputs, model.contract), heads.height_map(outputs, model.contract)
+        lifted = None
         if "walls" in model.contract and runtime.leans(geometry[0]):  # from above, or nobody knows where, no wall shows
-            found, shown = lifted(found, shown, outputs, labels[place], geometry[0], model.contract)
-        tables.append(of_tile(found, tile, tiling))
-        heights.append(heights_of_tile(shown, labels[place], tile, tiling))
+            lifted = lifts(outputs, labels[place], geometry[0], model.contract)
+        tables.append(of_tile(heads.decode_corners(outputs, model.contract), tile, tiling))
+        shown = heads.height_map(outputs, model.contract)
+        heights.append(heights_of_tile(shown, labels[place], tile, tiling, lifted))
     store.write_table(args.out, pa.concat_tables(tables))
     store.write_table(args.heights, pa.concat_tables(heights))
 

@@ -23,7 +23,7 @@ from kibs_steps import cli, scene, store
 from kibs_steps.corners import CORNERS
 from kibs_steps.errors import KibsError
 from kibs_steps.grid import Grid, Tiling
-from kibs_steps.heightmap import EMPTY
+from kibs_steps.heightmap import EMPTY, LIFT
 from kibs_steps.stitch import SECTIONS, distinct_corners, owner_blocks, section_ids, touches_edge
 
 LAYER = "roof_sections_image"
@@ -135,7 +135,8 @@ def edited(
 ) -> tuple[pa.Table, pa.Table]:
     """Sections after `stitch.SECTIONS`, by id, and the corners; `before` is what was stitched.
 
-    Corners that belonged to a section that was touched are free again, and the height map's sums over its old outline are gone.
+    Corners that belonged to a section that was touched are free again, and the height map's sums over its old outline are gone;
+    how far walls lift it stays.
     """
     row_of = {section: k for k, section in enumerate(before["section_id"].to_pylist())}
     old = shapely.from_wkb(before["outline"].to_numpy(zero_copy_only=False))
@@ -155,6 +156,7 @@ def edited(
         found |= {"edge": bool(edge[k]), "void": False, "owner": 0, "sums": EMPTY}
         if row is not None:
             found |= {name: column[name][row] for name in ("score", "split", "void")}
+            found["sums"] = [*EMPTY[:LIFT], *column["sums"][row][LIFT:]]
         if not touched[k]:
             found = {name: column[name][row] for name in SECTIONS.names}
         for name, value in found.items():

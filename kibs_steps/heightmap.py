@@ -4,6 +4,8 @@ Corners alone leave many a section without a plane, and each carries the whole e
 height of every cell of its map, so every piece of a section takes along the sums of least squares over its cells, in image
 coordinates (px) and metres above ground. Sums of pieces add up to those of their section exactly, whatever tiles and blocks
 they come from. `points` turns a section's sums into four points with heights that any fit of a plane can use beside corners.
+How far walls and shadows lift a section (`models.walls`) is added up beside them, weighted by how much of them was looked at: a
+tile sees the foot of some walls and not of others, and pieces that were lifted apart would tilt the whole.
 
 Most of a cell's error is that of the whole section; only `LOCAL` of its σ tells cells apart, and so bounds slopes.
 """
@@ -15,6 +17,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 SUMS = ("n", "x", "y", "h", "xx", "xy", "yy", "xh", "yh", "sigma")  # of cells: number, col, row, height, products, σ
+SUMS += ("lift", "looks")  # of pieces: lift (m) times looks, looks
+NUMBER, SIGMA, LIFT, LOOKS = map(SUMS.index, ("n", "sigma", "lift", "looks"))
 CELL = 16.0  # px²: what counts as one cell, whatever the map's stride
 EMPTY = [0.0] * len(SUMS)  # no cells
 LOCAL = 0.3  # tried on the demo: slopes are as little too flat as corners and cells together allow
@@ -31,7 +35,7 @@ def cells_of(labels: NDArray, stride: int) -> NDArray:
 def sums_by_label(
     labels: NDArray, mean: NDArray, sigma: NDArray, col: float, row: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The labels above 0 among cells (rows, cols) and their sums (n, 10).
+    """The labels above 0 among cells (rows, cols) and their sums (n, 12), not lifted.
 
     `mean` and `sigma` (m above ground) are the height map's cells; the tile's upper left corner lies at (`col`, `row`) px of the
     image, `labels` (s, s) are its pixels, 0 where the tile has no say.
@@ -43,8 +47,15 @@ def sums_by_label(
     x, y = col + (j + 0.5) * stride, row + (i + 0.5) * stride
     h, s = mean[i, j].astype(np.float64), sigma[i, j].astype(np.float64)
     terms = (np.ones(len(h)), x, y, h, x * x, x * y, y * y, x * h, y * h, s)
-    sums = np.stack([np.bincount(at, term, len(found)) for term in terms], axis=1).reshape(-1, len(SUMS))
-    return found.astype(np.int64), sums * (stride**2 / CELL)
+    sums = np.zeros((len(found), len(SUMS)))
+    for k, term in enumerate(terms):
+        sums[:, k] = np.bincount(at, term, len(found)) * (stride**2 / CELL)
+    return found.astype(np.int64), sums
+
+
+def lifts(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far (m) sections with these sums (n, 12) are lifted: the mean over their pieces by looks, 0 without any."""
+    return sums[:, LIFT] / np.where(sums[:, LOOKS] > 0, sums[:, LOOKS], 1.0)
 
 
 def table(labels: NDArray[np.int64], sums: NDArray[np.float64]) -> pa.Table:
@@ -67,11 +78,12 @@ def plane(sums: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def points(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Four points (4, 4: col, row px, height, σ m) that fix the same plane as a section's cells; none (0, 4) without cells.
+    """Four points (4, 4: col, row px, height, σ m) that fix the same plane as a section's cells, not lifted; none (0, 4) without
+    cells.
 
     They lie on the cells' principal axes, so their least squares plane is that of the cells wherever σ is one.
     """
-    n, sigma = sums[0], sums[-1]
+    n, sigma = sums[NUMBER], sums[SIGMA]
     if n <= 0:
         return np.zeros((0, 4))
     middle, gradient, height, width, axes = _moments(sums)
@@ -83,7 +95,7 @@ def points(sums: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _moments(sums: NDArray[np.float64]) -> tuple[NDArray, NDArray, float, NDArray, NDArray]:
     """Of a section's cells: middle (px), gradient (m per px), mean height (m), spread (px²) along their principal axes."""
-    n, x, y, h, xx, xy, yy, xh, yh, _ = sums
+    n, x, y, h, xx, xy, yy, xh, yh = sums[:SIGMA]
     middle = np.array([x, y]) / n
     spread = np.array([[xx, xy], [xy, yy]]) / n - np.outer(middle, middle)
     with_height = np.array([xh, yh]) / n - middle * (h / n)

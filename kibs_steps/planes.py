@@ -345,9 +345,10 @@ def planes(
     )
     centre = middle_of(outlines, facts)
     lean = facts.leans(centre)
-    pixel, height = pixel[corner], corners["height"].to_numpy()[corner]
-    sigma = corners["sigma"].to_numpy()[corner]
     sums = heightmap.column(sections["sums"])
+    lift = heightmap.lifts(sums)
+    pixel, height = pixel[corner], np.maximum(corners["height"].to_numpy()[corner] + lift[section], 0.0)
+    sigma = corners["sigma"].to_numpy()[corner]
     known = [heightmap.points(row) for row in sums] if rule == "robust" else [np.zeros((0, 4))] * len(sums)
     cell = np.concatenate([np.zeros((0, 4)), *known])
     inside = np.repeat(np.arange(len(known)), [len(k) for k in known])
@@ -357,7 +358,7 @@ def planes(
         return Points(*pixel.T, *where.T, z, height, sigma)
 
     points = standing(pixel, height, sigma, section)
-    cells = standing(cell[:, :2], cell[:, 2], cell[:, 3], inside)
+    cells = standing(cell[:, :2], cell[:, 2] + lift[inside], cell[:, 3], inside)
     count = np.arange(len(outlines) + 1)
     parts, shown = (
         [some.take(np.arange(first, end)) for first, end in pairwise(np.searchsorted(of, count))]
@@ -375,8 +376,8 @@ def planes(
     vertices = np.searchsorted(of, count)
     rows = []
     for i, mine in enumerate(parts):
-        n = float(sums[i, 0]) if len(shown[i].z) else 0.0
-        of_map = Cells(shown[i], n, float(sums[i, -1]) / max(n, 1.0))
+        n = float(sums[i, heightmap.NUMBER]) if len(shown[i].z) else 0.0
+        of_map = Cells(shown[i], n, float(sums[i, heightmap.SIGMA]) / max(n, 1.0))
         found = fit(mine, area_px[i], middle[i], ground[i], fallback, rule, of_map)
         own = slice(vertices[i], vertices[i + 1])
         rim = Rim(seen[own], projected[own], lean[i])

@@ -63,7 +63,9 @@ def test_roofs_of_a_surface_model_come_back(tmp_path, projection_height):
     outlines = [shapely.force_2d(toy_city.seen_outline(facts, outline)) for _, _, outline in roofs]
     n = len(roofs)
     columns = [[r[0] for r in roofs], shapely.to_wkb(outlines), [1.0] * n, [2] * n, [False] * n, [False] * n, [0] * n]
-    columns.append([[50.0, 0, 0, 9000.0, 0, 0, 0, 0, 0, 1.0]] * n)  # what a model thinks of heights is of no account
+    columns.append(
+        [[50.0, 0, 0, 9000.0, 0, 0, 0, 0, 0, 1.0, 9.0, 1.0]] * n
+    )  # what a model thinks of heights is of no account
     sections = pa.table([pa.array(c, f.type) for c, f in zip(columns, SECTIONS, strict=True)], schema=SECTIONS)
     owned, points = surface.measured(sections, facts, sampled(city_surface), toy_city.GROUND.at)
     table, _ = planes.planes(owned, points, facts, toy_city.GROUND.at, (6.0, 3.0), 7.5, "robust")

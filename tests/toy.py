@@ -7,6 +7,7 @@ operators, so detections are exact and every step runs in milliseconds.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -154,14 +155,15 @@ def corners_model(path: Path, terms: dict | None = None, bias: float = 0.0) -> P
     return save(*corner_parts(bias), path, contract("corners") if terms is None else terms)
 
 
-def walled_corners_model(path: Path, walls: dict, bias: float = 0.0) -> Path:
+def walled_corners_model(path: Path, walls: dict, untold: Sequence[str] = ()) -> Path:
     """The same corners by a model that has `walls` in its contract, and sees ground everywhere."""
-    nodes, constants, outputs = corner_parts(bias)
+    nodes, constants, outputs = corner_parts()
     nodes.append(helper.make_node("Identity", ["ground"], ["surface"]))
     shape = [1, 5, TILE // 2, TILE // 2]
     ground = np.zeros(shape, np.float32)
     ground[:, 0] = 1
     terms = contract("corners", walls=walls)
+    terms["trained_on"] |= {"untold": list(untold)} if untold else {}
     return save(nodes, {**constants, "ground": ground}, {**outputs, "surface": shape}, path, terms)
 
 

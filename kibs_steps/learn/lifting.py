@@ -174,10 +174,10 @@ def main(argv: list[str] | None = None) -> None:
 
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.lifting", description=main.__doc__)
     parser.add_argument("--model", required=True, help="ONNX file of a dense model for corners; gets `walls`")
-    parser.add_argument("--tiles", type=int, default=300, help="simulated tiles to learn from")
     parser.add_argument(
-        "--pool", help="folder of tiles of the model's GSD that a training rendered, to learn from instead"
+        "--tiles", type=int, default=300, help="at most so many tiles to learn from: simulated ones in which roofs lean"
     )
+    parser.add_argument("--pool", help="folder of tiles of the model's GSD that a training rendered, to take them from")
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that some of them show parts of")
     sources.add_look(parser)
     args = parser.parse_args(argv)

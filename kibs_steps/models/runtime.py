@@ -117,10 +117,8 @@ def opened(
         outputs = dict(zip(names, session.run(names, feed), strict=True))
         return {name: at_pixels(name, value[0], len(rgb)) for name, value in outputs.items()} if dense else outputs
 
-    def told(geometry: np.ndarray) -> Network:
-        geometry = geometry.copy()
-        for direction in contracts.untold(model):
-            geometry[:, TOLD[direction]] = 0
+    def looking(geometry: np.ndarray) -> Network:
+        geometry = told(model, geometry)
         if not dense:
             return lambda rgb: run(rgb, geometry)
         views = shown(model.contract, geometry)[:looks]
@@ -134,7 +132,15 @@ def opened(
 
         return network
 
-    return told
+    return looking
+
+
+def told(model: contracts.Model, geometry: np.ndarray) -> np.ndarray:
+    """What a model is told of a geometry (1, 6): what is kept from it (`untold`) is unknown."""
+    geometry = geometry.copy()
+    for direction in contracts.untold(model):
+        geometry[:, TOLD[direction]] = 0
+    return geometry
 
 
 def at_pixels(name: str, maps: np.ndarray, side: int) -> np.ndarray:

@@ -8,7 +8,8 @@ other roofs and how high those are), on average over the rim, and what the heigh
 an offset; the contract's `walls`, a small network of convolutions along the offsets, tells from them how likely each is.
 Neighbouring sections err alike, so half of a section's lift is that of it and its neighbours together.
 
-In: sections as labels, the outputs `surface` and `height` of a dense 3D model. Out: metres to lift each section.
+In: sections as labels, the outputs `surface` and `height` of a dense 3D model. Out: metres to lift each section, and how many
+looks tell so: a tile that does not see the foot of a section's walls has little to say of it.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ GROUND, ROOF, WALL, OTHER, SHADE = range(KINDS)
 SEEN = KINDS + 4  # traits of a direction: kinds, the section itself, roofs' heights, a wall's end on ground, on a roof
 TRAITS = 2 * SEEN + 4
 WHOLE = 9  # traits of a section
-OUTWARD = 1.5  # px from a rim's pixel to what lies beyond it
+OUTWARD = 1.5  # px: what lies so far from a rim's pixel, to the nearest of its neighbours, is beyond the rim
 LEAST = 24  # px of a section that is looked at
 LEANING = 0.25  # px per metre: what leans less shows no wall
-ROUND = 2  # px about a corner whose sections it goes with
+GUESS = 0.01  # looks that a px of a section counts for, as the height map alone tells something
 NEAR = 2  # px: sections no farther apart are neighbours
 SURE = (0.02, 0.98)  # probabilities of a wall, so that no look is the last word
 MOST = 16384  # looks of a kind at a time; OpenCV takes rows up to 32,767
@@ -54,7 +55,7 @@ def traits(
 ) -> Traits:
     """Traits of the sections of a tile: `labels` (s, s), 0 none, `surface` (KINDS, s/k, s/k) probabilities, `distribution`
     (B, s/l, s/l) over the bins of `heights` (the contract's), `geometry` (6,) as networks are told it."""
-    side = len(labels)
+    labels, side = labels.astype(np.int64), len(labels)
     area = np.bincount(labels.ravel())
     centres = np.asarray(heights["centres"], float)
     mean = np.tensordot(centres, distribution, (0, 0))
@@ -77,7 +78,7 @@ def traits(
     told_view, told_sun = geometry[4] > 0, geometry[4] > 0 and geometry[5] > 0
     base, facing = _along(tile, -view, told_view, np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
     tip, shading = _along(tile, sun - view, told_sun, np.array([0.0, 0.5, 0.5, 0.0, 1.0]))
-    own = _own(labels, number, height, distribution, np.asarray(heights["edges"], float), len(found))
+    own = _own(labels, number, planes, distribution, np.asarray(heights["edges"], float))
     middle = np.bincount(of[of >= 0], height[of >= 0], len(found)) / np.bincount(of[of >= 0], minlength=len(found))
     offsets = np.broadcast_to(OFFSETS, (len(found), len(OFFSETS)))
     along = [base, tip, own, offsets[:, None] / 10, (middle[:, None] + offsets)[:, None] / 20]
@@ -85,7 +86,7 @@ def traits(
     ones = np.ones(len(found))
     whole = [
         np.log(area[found]) / 5 - 1, facing / size, shading / size, middle / 10 - 1,
-        np.log(sums[:, -1] / np.maximum(sums[:, 0], 1e-9) + 0.1),
+        np.log(sums[:, heightmap.SIGMA] / np.maximum(sums[:, heightmap.NUMBER], 1e-9) + 0.1),
         ones * told_view * np.hypot(*view) / 2, ones * told_sun * np.hypot(*(sun - view)) / 2, ones * told_view,
         ones * (geometry[5] > 0),
     ]  # fmt: skip
@@ -111,7 +112,7 @@ def _along(tile: _Tile, away: NDArray, told: bool, stays: NDArray) -> tuple[NDAr
     side = len(tile.labels)
     if not told or length < LEANING:
         return found, count
-    out = np.rint(away / length * OUTWARD).astype(int)
+    out = np.rint(np.clip(away / length * OUTWARD, -1, 1)).astype(int)  # one of eight neighbours
     beyond = np.pad(tile.labels, 2, constant_values=-1)[2 + out[1] : side + 2 + out[1], 2 + out[0] : side + 2 + out[0]]
     row, col = np.nonzero((tile.of >= 0) & (beyond != tile.labels) & (beyond >= 0))
     if not len(row):
@@ -169,24 +170,23 @@ def _read(images: NDArray, x: NDArray, y: NDArray) -> NDArray:
     return np.stack(list(read))
 
 
-def _own(
-    labels: NDArray, number: NDArray, height: NDArray, distribution: NDArray, edges: NDArray, count: int
-) -> NDArray:
-    """What the height map says of each offset (n, 2, offsets): mean density (1/m) over a section's cells, and of its log."""
-    label = heightmap.cells_of(labels, len(labels) // distribution.shape[1])[
-        : distribution.shape[1], : distribution.shape[2]
-    ]
+def _own(labels: NDArray, number: NDArray, planes: NDArray, distribution: NDArray, edges: NDArray) -> NDArray:
+    """What the height map says of each offset (n, 2, offsets): mean density (1/m) over a section's cells, and of its log;
+    `planes` (n, 3) of the sections."""
+    bins, *shape = distribution.shape
+    stride = len(labels) // shape[0]
+    label = heightmap.cells_of(labels, stride)[: shape[0], : shape[1]]
     row, col = np.nonzero(number[label] >= 0)
     mine = number[label[row, col]]
-    plane = heightmap.cells_of(height, len(labels) // distribution.shape[1])[row, col]
-    metres = plane[:, None] + OFFSETS
-    at = np.clip(np.searchsorted(edges, metres, side="right") - 1, 0, len(edges) - 2)
+    a, b, c = planes[mine].T
+    metres = ((a * (col + 0.5) + b * (row + 0.5)) * stride + c)[:, None] + OFFSETS
+    at = np.clip(np.searchsorted(edges, metres, side="right") - 1, 0, bins - 1)
     density = np.take_along_axis((distribution[:, row, col] / np.diff(edges)[:, None]).T, at, axis=1)
     density = np.where((metres >= 0) & (metres <= edges[-1]), density, 0.0)
-    found = np.zeros((count, 2, len(OFFSETS)))
+    found = np.zeros((len(planes), 2, len(OFFSETS)))
     np.add.at(found[:, 0], mine, density)
     np.add.at(found[:, 1], mine, np.log(density + 1e-3) / 5)
-    return found / np.maximum(np.bincount(mine, minlength=count), 1)[:, None, None]
+    return found / np.maximum(np.bincount(mine, minlength=len(planes)), 1)[:, None, None]
 
 
 def likely(seen: Traits, terms: dict[str, Any]) -> NDArray[np.float64]:
@@ -218,8 +218,12 @@ def leads(terms: dict[str, Any]) -> bool:
     wide = len(terms["bias"])
     rows = [5 * TRAITS, *[5 * wide] * (len(terms["layers"]) - 1)]
     widths = [*[wide] * (len(terms["layers"]) - 1), 1]
-    return np.shape(terms["whole"]) == (WHOLE, wide) and all(
-        np.shape(layer["weights"]) == (row, width) and len(layer["bias"]) == width
+
+    def shaped(matrix: list[list[float]], rows: int, width: int) -> bool:
+        return len(matrix) == rows and all(len(row) == width for row in matrix)
+
+    return shaped(terms["whole"], WHOLE, wide) and all(
+        shaped(layer["weights"], row, width) and len(layer["bias"]) == width
         for layer, row, width in zip(terms["layers"], rows, widths, strict=True)
     )
 
@@ -241,17 +245,14 @@ def lifts(labels: NDArray, seen: Traits, terms: dict[str, Any]) -> NDArray[np.fl
     return (found + total / np.maximum(weight, 1)) / 2
 
 
-def about(labels: NDArray, lift: NDArray, col: NDArray, row: NDArray) -> NDArray[np.float64]:
-    """The mean lift (m) of the sections within `ROUND` px of places (px), by their pixels; 0 where there are none."""
-    side = len(labels)
-    total, count = np.zeros(len(col)), np.zeros(len(col))
-    for down in range(-ROUND, ROUND + 1):
-        for right in range(-ROUND, ROUND + 1):
-            y, x = np.floor(row).astype(int) + down, np.floor(col).astype(int) + right
-            label = labels[np.clip(y, 0, side - 1), np.clip(x, 0, side - 1)]
-            total += np.where(label > 0, lift[label], 0.0)
-            count += label > 0
-    return total / np.maximum(count, 1)
+def looks(labels: NDArray, seen: Traits) -> NDArray[np.float64]:
+    """How much of what lifts each label (0 … labels.max()) of a tile is seen: px of its rim whose wall ends in the tile, and
+    `GUESS` for each of its own; 0 where nothing was looked at."""
+    found = np.zeros(int(labels.max(initial=0)) + 1)
+    facing = seen.whole[:, 1] * np.sqrt(seen.area)
+    ends = seen.along[:, KINDS + 2 : SEEN].sum(axis=(1, 2))
+    found[seen.labels] = facing * ends + GUESS * seen.area
+    return found
 
 
 def medians(shares: NDArray) -> NDArray[np.float64]:

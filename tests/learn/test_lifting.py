@@ -8,7 +8,7 @@ from kibs_steps import view
 
 torch = pytest.importorskip("torch", reason="learning needs the extra `learn` (torch)")
 
-from kibs_steps.learn import augmentation, dataset, export, lifting, training  # noqa: E402
+from kibs_steps.learn import augmentation, dataset, examples, export, lifting, training  # noqa: E402
 from kibs_steps.models import contract as contracts  # noqa: E402
 from kibs_steps.models import walls  # noqa: E402
 
@@ -53,7 +53,7 @@ def untrained(tmp_path):
 
 def test_a_model_gets_its_walls(untrained, monkeypatch, capsys):
     monkeypatch.setattr(lifting, "FEW", 10)
-    lifting.main([f"--model={untrained}", "--tiles=2"])
+    lifting.main([f"--model={untrained}", "--tiles=3"])  # the second is seen from above
     assert "lifts learned on 2 tiles" in capsys.readouterr().out
     found = contracts.load(untrained, "corners").contract
     assert walls.leads(found["walls"])
@@ -90,3 +90,29 @@ def test_without_a_pool_tiles_are_seen_as_the_contract_says():
     for sample in lifting.tiles(None, 2, contract, ()):  # some degrees about it
         east, north = view.lean(100.0, 60.0)
         assert sample.geometry[:2] == pytest.approx([-east / 0.38, north / 0.38], abs=0.15)
+
+
+def test_a_lesson_tells_how_much_higher_a_section_stands_than_the_height_map_says(monkeypatch):
+    sample = dataset.simulated(np.random.default_rng(4), 96, view=(100.0, 60.0))
+    monkeypatch.setattr(examples, "supposed", lambda sample, rng: np.maximum(sample.labels, 0).astype(np.int32))
+    edges = np.arange(0.0, 31.0)
+    heights = {"edges": edges.tolist(), "centres": (edges[:-1] + 0.5).tolist()}
+    kept = {where: [None] * 3 for where in ("inside", "rim", "outside")}
+    model = contracts.Model(None, "", {"tile": 128, "heights": heights, "blend": kept})
+
+    def session(geometry):
+        surface, height = np.zeros((5, 64, 64), np.float32), np.zeros((30, 32, 32), np.float32)
+        surface[walls.GROUND], height[4] = 1, 1  # ground all over, 4.5 m all over
+        return lambda rgb: {"surface": surface, "height": height} if len(rgb) == 128 else None
+
+    seen, true = lifting.lessons(sample, model, session, np.random.default_rng(0), unlit=0.0)
+    expected = [
+        np.nanmedian(sample.height[sample.labels == label]) - 4.5
+        for label in np.unique(sample.labels[sample.labels > 0])
+        if (sample.labels == label).sum() >= walls.LEAST
+    ]
+    assert len(expected) > 2
+    assert true.lift == pytest.approx(expected, abs=1e-3)
+    assert seen.lift.tolist() == true.lift.tolist()
+    assert not seen.along[:, walls.WALL].any()
+    assert true.along[:, walls.WALL].any()
