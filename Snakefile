@@ -58,7 +58,7 @@ rule all:
     """Build every scene."""
     default_target: True
     input:
-        [f for p in PLANS.values() for f in published(p) + kept(p)],
+        everything,
 
 
 rule detect:

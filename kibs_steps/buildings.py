@@ -164,21 +164,23 @@ def _facing(
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far (m) edges i and j run along each other, and the step (m) there; 0 m where they do not."""
     span = end - start
-    size = np.maximum(np.hypot(*span.T), 1e-9)
-    u = span / size[:, None]
+    u = span / np.maximum(np.hypot(*span.T), 1e-9)[:, None]
     facing = (u[i] * u[j]).sum(axis=1) <= FACING
-    from_j = ((start[j] - start[i]) * u[i]).sum(axis=1)
-    to_j = ((end[j] - start[i]) * u[i]).sum(axis=1)
-    low = np.maximum(np.minimum(from_j, to_j), 0.0)
-    high = np.minimum(np.maximum(from_j, to_j), size[i])
+    way = np.where(facing[:, None], u[i] - u[j], [1.0, 0.0])  # the line between both: neither edge comes first
+    way /= np.hypot(*way.T)[:, None]
+    first, last = (((p - start[i]) * way).sum(axis=1) for p in (start[i], end[i]))
+    after, before = (((p - start[i]) * way).sum(axis=1) for p in (start[j], end[j]))
+    low, high = np.maximum(first, before), np.minimum(last, after)
     along = np.where(facing, np.maximum(high - low, 0.0), 0.0)
     middle = (low + high) / 2
-    turn = to_j - from_j
-    t = np.clip((middle - from_j) / np.where(np.abs(turn) < 1e-9, 1.0, turn), 0.0, 1.0)
-    here, there = start[i] + middle[:, None] * u[i], start[j] + t[:, None] * span[j]
+    here, there = (
+        start[k] + np.clip((middle - a) / np.where(facing, b - a, 1.0), 0.0, 1.0)[:, None] * span[k]
+        for k, a, b in ((i, first, last), (j, after, before))
+    )
     step = np.abs(_heights(planes[of[i]], here) - _heights(planes[of[j]], there))
-    normal = np.stack([u[i][:, 1], -u[i][:, 0]], axis=1)
-    reach = SLACK + np.abs((normal * lean[of[i]]).sum(axis=1)) * np.minimum(step, STEP)
+    normal = np.stack([way[:, 1], -way[:, 0]], axis=1)
+    leans = np.maximum(*(np.abs((normal * lean[of[k]]).sum(axis=1)) for k in (i, j)))
+    reach = SLACK + leans * np.minimum(step, STEP)
     near = np.abs(((there - here) * normal).sum(axis=1)) <= np.maximum(APART, reach)
     return np.where(near, along, 0.0), step
 

@@ -68,7 +68,8 @@ def command(argv: list[str], config: dict[str, Any], leave_out: Iterable[str]) -
     """The command line `argv` once more, for the rest of the city; `config` is what `--config` gave it."""
     values = {**config, "leave_out": ",".join(sorted(leave_out))}
     text = [
-        f"{key}={value!r}" if isinstance(value, (list, dict)) else f"{key}={value}" for key, value in values.items()
+        f"{key}={value!r}" if isinstance(value, (list, dict)) else f"{key}={'' if value is None else value}"
+        for key, value in values.items()
     ]
     return [sys.executable, "-m", "snakemake", *argv, "--nolock", "--config", *text]
 

@@ -59,6 +59,7 @@ def roof_type(faces: list[Face], planes: np.ndarray) -> str:
     slope, azimuth = slope_azimuth(planes[:, 0], planes[:, 1], 0.0)
     counted = area >= 0.1 * area.max()
     pitched = np.flatnonzero(counted & (slope >= PITCHED))
+    pitched = pitched[np.lexsort((azimuth[pitched], -area[pitched].round(3)))]  # the largest leads, whatever their ids
     level = area[counted & (slope < PITCHED)].sum() / area[counted].sum()
     if not len(pitched):
         return "flat"

@@ -7,9 +7,11 @@ data themselves (`scene`, `truth`) follows in the first jobs. docs/inputs.md lis
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kibs_steps import sources
 from kibs_steps.errors import KibsError
 
 if TYPE_CHECKING:
@@ -24,6 +26,26 @@ class FootprintsUnusable(KibsError):
     """Footprints that cannot be read or placed."""
 
 
+class FromTheFuture(KibsError):
+    """A file that is dated later than now."""
+
+
+def dated(plan: Plan) -> None:
+    """Refuse files dated later than now (as unpacked from an archive made farther east): Snakemake refuses what is made of
+    them."""
+    files = [
+        *sources.files(plan.raster),
+        *plan.terrain_files,
+        *plan.named_files,
+        *(m.path for m in plan.models.values()),
+    ]
+    for path in map(Path, files):
+        if path.exists() and max(path.stat().st_mtime, path.lstat().st_mtime) > time.time() + 1:
+            raise FromTheFuture(
+                f"{path} is dated later than now: give it today's date (touch {path}), its content counts alone"
+            )
+
+
 def check(plan: Plan, results: Path) -> list[str]:
     """Refuse what a scene cannot be made from; returns what is doubtful. Raises the named errors of docs/inputs.md."""
     import pyproj
@@ -32,6 +54,7 @@ def check(plan: Plan, results: Path) -> list[str]:
 
     writable(results / plan.name)
     settings = plan.settings
+    dated(plan)
     if settings.get("simulate") is not None:
         return []
     grid = georeference.model_grid(plan.raster, plan.models["sections"].contract["gsd"], settings.get("aoi"))
@@ -73,6 +96,8 @@ def bands_of(settings: dict[str, Any]) -> tuple[int, ...] | None:
 
 def writable(folder: Path) -> None:
     """Refuse a folder for results that cannot be made or written to."""
+    if folder.is_symlink() and not folder.exists():
+        raise ResultsUnwritable(f"{folder} is a link to {folder.readlink()}, which is not there: mount it, or make it")
     there = folder
     while not there.exists() and there != there.parent:
         there = there.parent

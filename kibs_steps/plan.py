@@ -8,6 +8,7 @@ dates of files say and wherever an earlier run was killed.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Collection
 from importlib.metadata import version
@@ -149,6 +150,7 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise BadConfig(f"scene name {name!r}: use letters, digits, '.', '_' and '-' only, it names a folder")
+    settings = {**settings, **named(settings, results)}
     if settings["mode"] == "paper":
         settings = {**settings, **PAPER_MODE}
     models = models_for(settings, base)
@@ -202,9 +204,27 @@ def plan(name: str, settings: dict[str, Any], base: Path, results: Path) -> Plan
         raise BadConfig(f"scene {name}: feed=truth needs truth=FILE")
     blocks = tiling.blocks(width, height)
     left_out = leaving_out(name, str(settings.get("leave_out") or ""), blocks)
-    signature = signatures(settings, source, truth_source, models, tiling, cache, left_out)
+    image = source if simulated is not None else source[0]
+    signature = signatures(settings, source, image, truth_source, models, tiling, cache, left_out)
     warnings = [] if settings["feed"] == "truth" else angle_warnings(settings, models)
     return Plan(name, settings, raster, dtm, truth, tiling, blocks, models, signature, warnings, left_out)
+
+
+def named(settings: dict[str, Any], results: Path) -> dict[str, str]:
+    """The files that settings name as Snakemake can take them: what lies in the folder of results by its absolute path, since
+    rules would make it again. Raises `BadConfig` for names that it would take for patterns."""
+    found = {}
+    for key in ("raster", "dtm", "models", *NAMED):
+        path = settings.get(key)
+        if not isinstance(path, str) or sources.is_remote(path):
+            continue
+        if re.search(r"\{.+\}", path):
+            raise BadConfig(
+                f"{key} {path}: Snakemake takes what stands in braces for a pattern: give it another name, or a link"
+            )
+        if Path(os.path.normpath(path)).is_relative_to(results):
+            found[key] = os.path.abspath(path)
+    return found
 
 
 def leaving_out(name: str, text: str, blocks: list[Block]) -> dict[str, str]:
@@ -324,6 +344,7 @@ def grid_size(raster: str, gsd: float, aoi: str | None) -> tuple[int, int]:
 def signatures(
     settings: dict[str, Any],
     source: Any,
+    image: Any,
     truth: Any,
     models: dict[str, contract.Model],
     tiling: Tiling,
@@ -349,7 +370,7 @@ def signatures(
     seen: dict[str, Any] = {task: angles if m.contract.get("geometry_input") else None for task, m in models.items()}
     # A contract may stand in a file of its own beside the network.
     known = {task: [m.sha256, m.contract] for task, m in models.items()}
-    s = {"source": h(version("kibs-steps"), source)}
+    s = {"source": h(version("kibs-steps"), source), "image": h(version("kibs-steps"), image)}
     s["scene"] = h(
         s["source"],
         angles,
@@ -358,7 +379,7 @@ def signatures(
         models["sections"].contract["gsd"],
     )
     s["truth"] = h(s["scene"], truth, some("truth_frame", "truth_z"))
-    s["tiles"] = h(s["source"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
+    s["tiles"] = h(s["image"], some("bands"), content("aoi"), models["sections"].contract["gsd"], tiling)
     for task, model in models.items():
         s[f"model_{task}"] = h(*known[task], str(model.path))
     inference = some("provider", "threads", "looks")  # sums in another order differ in their last bits

@@ -90,7 +90,9 @@ def _spans(
     `start`, `end` (e, 2) are edges in pixels. Every row's centre line is cut by the edges (half-open, so a shared vertex
     counts once); between the first and second, third and fourth … cut is inside.
     """
-    low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
+    down = (start[:, 1] > end[:, 1])[:, None]  # an edge is cut alike from both its sides
+    start, end = np.where(down, end, start), np.where(down, start, end)
+    low, high = start[:, 1], end[:, 1]
     first = np.clip(np.ceil(low - 0.5), 0, height).astype(np.int64)
     count = np.clip(np.ceil(high - 0.5), 0, height).astype(np.int64) - first
     edge = np.repeat(np.arange(len(start)), count)

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import shapely
+import shapely.affinity
 import toy_city
 
 from kibs_steps import buildings, store
@@ -111,6 +112,25 @@ def test_order_does_not_matter():
     for section, building in whole.items():
         assert building <= section
         assert whole[building] == building
+
+
+def test_ids_do_not_matter():
+    """Neither of two neighbours that face each other at an angle comes first."""
+    random = np.random.default_rng(1)
+    found = []
+    for _ in range(300):
+        one = box(0, 0, random.uniform(4, 14), random.uniform(4, 9))
+        other = shapely.affinity.rotate(
+            box(0, 0, random.uniform(4, 14), random.uniform(4, 9)), random.normal(0, 8), origin=(0, 0)
+        )
+        other = shapely.affinity.translate(other, random.uniform(-6, 8), one.bounds[3] + random.uniform(-0.2, 1.2))
+        planes = [(*random.normal(0, 0.3, 2), random.uniform(4, 8), 0.0, 0.0) for _ in range(2)]
+        leans = np.array([(0.3, 0.5), (-0.2, 0.6)])
+        forth = grouped([one, other], planes, leans)
+        back = grouped([other, one], planes[::-1], leans[::-1])
+        assert len(set(forth)) == len(set(back))
+        found.append(len(set(forth)))
+    assert 30 < found.count(1) < 270
 
 
 def test_chunks_do_not_matter(monkeypatch):

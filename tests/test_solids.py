@@ -1,5 +1,6 @@
 """Solids against closed form: volumes, types, ladders, courtyards, noise; every published shell passes the gate."""
 
+import itertools
 import json
 from collections import Counter
 
@@ -59,6 +60,20 @@ def test_roof_types(name, kind):
 def test_two_slopes_falling_towards_each_other_are_no_gable():
     butterfly = [(ring, (0, -b, 6 + 8 * b if b < 0 else 6)) for ring, (_, b, _) in houses.GABLE]
     assert built(butterfly)[2]["roof_type"] == "complex"
+
+
+def test_the_type_of_a_roof_does_not_depend_on_ids():
+    """Slopes that face 0°, 20° and 40°: the middle one goes with either."""
+    facing = np.radians([0, 20, 40])
+    planes = np.array([(-0.5 * np.sin(a), -0.5 * np.cos(a), 5.0) for a in facing])
+    for wide in (4000, 5000, 6000):  # mm: the middle one is the smallest, as large as the others, the largest
+        ends = np.cumsum([0, 5000, wide, 5000])
+        squares = [[[(a, 0), (b, 0), (b, 5000), (a, 5000)]] for a, b in itertools.pairwise(ends.tolist())]
+        kinds = {
+            features.roof_type([Face(i, squares[k]) for i, k in enumerate(order)], planes[list(order)])
+            for order in itertools.permutations(range(3))
+        }
+        assert len(kinds) == 1
 
 
 def test_attributes_of_a_gable_house():

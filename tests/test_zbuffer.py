@@ -45,6 +45,20 @@ def test_shared_edges_leave_no_gap_and_no_overlap():
     assert np.array_equal(alone == 1, whole)
 
 
+def test_faces_traced_from_pixels_leave_no_gap_and_no_overlap():
+    """An edge whose cut falls on a pixel's centre is cut alike from both its sides, whichever way their rings run."""
+    rng = np.random.default_rng(0)
+    frame = Grid("EPSG:32631", 500_000.0, 5_400_000.0, 0.38, 40, 40)
+    rim = np.array([(0, 0), (40, 0), (40, 40), (0, 40)], float)
+    for _ in range(200):
+        centre = rng.integers(2, 38, 2).astype(float)
+        covered = np.zeros((40, 40), int)
+        for k in range(4):
+            ring = frame.to_map(np.array([centre, rim[k], rim[(k + 1) % 4]]))[:: rng.choice([-1, 1])]
+            covered += render_faces([Polygon(np.column_stack([ring, np.full(3, 5.0)]))], (0.0, 0.0), frame).face >= 0
+        assert (covered == 1).all()
+
+
 def test_holes_are_not_covered():
     face = Polygon(square(10, 10, 40, 40, 3.0), (square(20, 20, 30, 30, 3.0)[::-1],))
     hits = render_faces([face], (0.0, 0.0), FRAME)

@@ -89,12 +89,8 @@ def opened(
     """
     import onnxruntime as ort
 
-    name, package, settings = PROVIDERS[provider]
-    if name not in ort.get_available_providers():
-        raise ProviderMissing(
-            f"provider={provider}: this onnxruntime has {', '.join(ort.get_available_providers())}: install {package} in its "
-            "place, or set provider=cpu"
-        )
+    available(provider)
+    name, _, settings = PROVIDERS[provider]
     if provider == "openvino":
         settings = {**settings, "num_of_threads": threads}
     options = ort.SessionOptions()
@@ -133,6 +129,20 @@ def opened(
         return network
 
     return looking
+
+
+def available(provider: str) -> None:
+    """Refuse what this onnxruntime was not made with. Raises `ProviderMissing`."""
+    if provider == "cpu":
+        return
+    import onnxruntime as ort
+
+    name, package, _ = PROVIDERS[provider]
+    if name not in ort.get_available_providers():
+        raise ProviderMissing(
+            f"provider={provider}: this onnxruntime has {', '.join(ort.get_available_providers())}: install {package} in its "
+            "place, or set provider=cpu"
+        )
 
 
 def told(model: contracts.Model, geometry: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -58,6 +59,13 @@ def case(part: str, given: str, error: str, message: str) -> Callable:
 @case("raster", "a file that is not there", "RasterMissing", "raster nowhere.tif does not exist: check the path")
 def _(folder):
     return {"raster": "nowhere.tif"}
+
+
+@case("raster", "a file dated later than now", "FromTheFuture",
+      "a.tif is dated later than now: give it today's date (touch a.tif), its content counts alone")  # fmt: skip
+def _(folder):
+    os.utime(folder / "a.tif", (time.time() + 3600,) * 2)
+    return {}
 
 
 @case("raster", "a file that is no raster", "NotARaster",
@@ -394,6 +402,12 @@ def _(folder):
     return {"scene": "a;rm -rf"}
 
 
+@case("settings", "braces in a file's name", "BadConfig",
+      "raster a{rgb}.tif: Snakemake takes what stands in braces for a pattern: give it another name, or a link")  # fmt: skip
+def _(folder):
+    return {"raster": "a{rgb}.tif"}
+
+
 @case("models", "no model there", "NotAModel",
       "no model at nowhere: give `models=` a folder with sections.onnx and corners.onnx")  # fmt: skip
 def _(folder):
@@ -453,6 +467,13 @@ def _(folder):
       "models/sections.onnx has 3.0 GiB, an ONNX file at most 2: give a smaller model")  # fmt: skip
 def _(folder):
     os.truncate(folder / "models/sections.onnx", 3 * 2**30)
+    return {}
+
+
+@case("results", "a link to a disk that is not there", "ResultsUnwritable",
+      "results is a link to nowhere, which is not there: mount it, or make it")  # fmt: skip
+def _(folder):
+    (folder / "results").symlink_to("nowhere")
     return {}
 
 

@@ -181,3 +181,9 @@ def test_verify_keeps_every_edit_and_asks_for_tiles_anew(tmp_path, monkeypatch):
         verify.main([str(folder)])
     assert sorted(p.name for p in (folder / "tiles3d").iterdir() if p.is_file()) == ["0_0.glb.changed"]
     assert not (folder / ".tmp-tiles3d").exists()
+
+
+def test_the_rest_is_asked_for_as_the_whole_was():
+    """`--config scene=` is every scene, not one called None."""
+    words = failures.command(["all"], {"scene": None, "block": 2}, ["town/r0c0/sections"])
+    assert {"scene=", "block=2", "leave_out=town/r0c0/sections"} <= set(words)

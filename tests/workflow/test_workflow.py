@@ -152,6 +152,53 @@ def test_another_view_reruns_from_the_planes(copy):
     assert not {"tiles", "sections", "blend", "corners", "stitch"} & set(done)
 
 
+def test_another_terrain_reruns_from_the_planes(copy):
+    done = jobs(run(copy, dtm=101, only=MAIN))
+    assert {"scene", "planes", "ground"} <= set(done)
+    assert not {"tiles", "sections", "blend", "corners", "stitch"} & set(done)
+
+
+def test_everything_may_be_forced(copy):
+    before = digests(copy)
+    assert {"blend", "corners", "solids", "geopackage"} <= set(jobs(run(copy, "--forceall")))
+    assert digests(copy) == before
+
+
+def test_results_without_their_records_are_not_taken_for_made(copy):
+    """What made them is written in .snakemake alone: with other settings they would stay as they are."""
+    shutil.rmtree(copy / ".snakemake")
+    done = subprocess.run(command(copy, view_azimuth=95), cwd=copy, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "results/town was not made here, or the folder .snakemake was deleted" in done.stderr
+
+
+def test_what_another_scene_made_may_be_an_input(copy):
+    assert "rule tiles" in run(copy, "--dry-run", scene="new", dtm="results/town/dtm.tif")
+
+
+def test_a_set_in_the_place_of_the_trained_one_is_not_trained(copy):
+    """`train` would write models/mine; who builds a city with it wants it as it is."""
+    shutil.copytree(copy / "models", copy / "models/mine")
+    assert not {"trained", "exported"} & set(jobs(run(copy, "--dry-run", models="models/mine")))
+
+
+def test_a_missing_provider_is_told_before_any_work(tmp_path):
+    folder = world(tmp_path)
+    done = subprocess.run(command(folder, provider="openvino"), cwd=folder, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "provider=openvino: this onnxruntime has" in done.stderr
+    assert not (folder / "results/town").exists()
+
+
+def test_a_deleted_picture_of_the_evaluation_is_made_again(copy):
+    layer = pyogrio.read_dataframe(copy / "results/town/city.gpkg", layer="roof_sections_image")
+    layer.to_file(copy / "truth.gpkg")
+    told = {"truth": "truth.gpkg", "truth_frame": "map", "truth_z": "above_ground"}
+    run(copy, **told)
+    (copy / "results/town/evaluation.png").unlink()
+    assert set(jobs(run(copy, **told))) == {"evaluation"}
+
+
 def test_deleted_block_is_redone_alone(copy):
     before = digests(copy)
     shutil.rmtree(copy / "results/town/blocks/r000c001")

@@ -2,6 +2,7 @@
 
 import atexit
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from snakemake.io import IOFile
 
 from kibs_steps import cli, failures, inputs as user_inputs, plan as plans, settings
 from kibs_steps import sources
+from kibs_steps.models import runtime
 
 RESULTS = Path("results")
 RUN = f"{workflow.basedir}/envs/run.yaml"
@@ -33,6 +35,11 @@ def planned():
     }
     if not workflow.remote_exec:
         for p in found.values():
+            own = (
+                workflow.deployment_settings.deployment_method
+            )  # then jobs bring an onnxruntime of their own
+            if p.settings["feed"] == "models" and not own:
+                runtime.available(p.settings["provider"])
             p.warnings.extend(user_inputs.check(p, RESULTS))
     return found
 
@@ -102,7 +109,10 @@ def inputs(step, *outputs):
         def choose(wildcards):
             found = files(wildcards) if callable(files) else files.format(**wildcards)
             wanted = signature(step)(wildcards)
-            if not all(made(output.format(**wildcards), wanted) for output in outputs):
+            forced = workflow.dag_settings.forceall or workflow.dag_settings.forcerun
+            if forced or not all(
+                made(output.format(**wildcards), wanted) for output in outputs
+            ):
                 return found
             return ancient(
                 [
@@ -115,6 +125,27 @@ def inputs(step, *outputs):
         return choose
 
     return given
+
+
+def everything(wildcards):
+    """All files of all scenes; refuses those that Snakemake has no record of, which it would take for made whatever the settings."""
+    found = []
+    for p in PLANS.values():
+        files = published(p) + kept(p)
+        facts = f"results/{p.name}/scene.json"
+        recorded = workflow.persistence.params(IOFile(facts))
+        if (
+            Path(facts).exists()
+            and not recorded
+            and not workflow.dag_settings.forceall
+            and any(map(os.path.exists, files))
+        ):
+            raise WorkflowError(
+                f"results/{p.name} was not made here, or the folder .snakemake was deleted: nothing tells from what it was made. "
+                "Start where .snakemake lies, or move it away and it is made again"
+            )
+        found += files
+    return found
 
 
 LAST_STEP = {"detected": "feed", "fed": "feed", "solids.parquet": "solids"}
@@ -203,7 +234,7 @@ def using(method):
 
 def published(p):
     """All published files of a scene."""
-    names = PUBLISHED + (["evaluation.json"] if p.truth else [])
+    names = PUBLISHED + (["evaluation.json", "evaluation.png"] if p.truth else [])
     names += ["paper.tif"] if p.settings["mode"] == "paper" else []
     return [f"results/{p.name}/{f}" for f in names]
 

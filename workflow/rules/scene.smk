@@ -80,7 +80,7 @@ rule tiled:
     conda:
         RUN
     params:
-        signature=signature("source"),
+        signature=signature("image"),
         raster=lambda w: plan(w).raster,
     shell:
         "python -m kibs_steps.tiled --raster {params.raster:q} --out {output:q} > {log:q} 2>&1"
@@ -117,7 +117,7 @@ given = inputs("model_{task}", "results/{scene}/models/{task}.json")
 rule model:
     """Check a model's contract, and write it down with the file's hash."""
     input:
-        given(lambda w: str(plan(w).models[w.task].path)),
+        given(lambda w: os.path.abspath(plan(w).models[w.task].path)),
     output:
         "results/{scene}/models/{task}.json",
     log:
