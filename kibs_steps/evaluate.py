@@ -177,11 +177,13 @@ def read_sections(paths: list[str]) -> tuple[metrics.Predicted, NDArray[np.objec
 
 
 def read_corners(paths: list[str]) -> metrics.Corners:
-    """Found corners of all blocks, each once however many sections it was filed to."""
+    """Found corners of all blocks, each once however many sections it was filed to, at the mean of its heights there."""
     columns = ["col", "row", "height"]
     rows = pa.concat_tables([store.read_table(path, columns) for path in paths])
-    values = np.unique(np.column_stack([rows[name].to_numpy() for name in columns]).astype(float), axis=0)
-    return metrics.Corners(values[:, :2], values[:, 2], np.ones(len(values), bool))
+    values = np.column_stack([rows[name].to_numpy() for name in columns]).astype(float)
+    place, at, count = np.unique(values[:, :2], axis=0, return_inverse=True, return_counts=True)
+    height = np.bincount(at.ravel(), values[:, 2], len(place)) / count
+    return metrics.Corners(place, height, np.ones(len(place), bool))
 
 
 def evaluation(

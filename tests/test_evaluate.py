@@ -4,6 +4,7 @@ import csv
 import json
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import rasterio
 import shapely
@@ -193,6 +194,15 @@ def test_shared_corners_are_one():
     )
     assert len(shared.height) == 3
     assert shared.seen.sum() == 1
+
+
+def test_a_corner_filed_to_two_sections_is_one(tmp_path):
+    """Each section is lifted by itself, so that a corner may stand at two heights."""
+    rows = {"col": [1.5, 1.5, 7.0], "row": [2.0, 2.0, 2.0], "height": [5.0, 6.0, 3.0]}
+    store.write_table(tmp_path / "filed.parquet", pa.table(rows))
+    found = evaluate.read_corners([tmp_path / "filed.parquet"])
+    assert found.place.tolist() == [[1.5, 2.0], [7.0, 2.0]]
+    assert found.height.tolist() == [5.5, 3.0]
 
 
 def run(folder, scene, found=None, true=None, **extra):
