@@ -79,7 +79,7 @@ class Joined(NamedTuple):
 
 class Parts(NamedTuple):
     """Columns of outlines (px) on their way: piece number (or 0), group, geometry, score, void, split, owner,
-    evidence (n, 21), sums of heights (n, 10)."""
+    evidence (n, 21), sums of heights (n, 12)."""
 
     number: np.ndarray
     group: np.ndarray
@@ -204,7 +204,7 @@ def united(pieces: Parts, scorer: dict[str, Any] | None = None, thresholds: dict
 
 
 def of_pieces(labels: np.ndarray, heights: pa.Table) -> np.ndarray:
-    """Sums of heights (n, 10) of a block's pieces with these labels, zero for those without."""
+    """Sums of heights (n, 12) of a block's pieces with these labels, zero for those without."""
     sums = np.zeros((len(labels), len(heightmap.SUMS)))
     if len(heights):
         known = heights["label"].to_numpy()
