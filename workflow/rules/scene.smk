@@ -117,6 +117,7 @@ given = inputs("model_{task}", "results/{scene}/models/{task}.json")
 rule model:
     """Check a model's contract, and write it down with the file's hash."""
     input:
+        # Wholly named: a set called like the one that `train` makes is no output of it here.
         given(lambda w: os.path.abspath(plan(w).models[w.task].path)),
     output:
         "results/{scene}/models/{task}.json",
@@ -130,5 +131,6 @@ rule model:
         RUN
     params:
         signature=signature("model_{task}"),
+        model=lambda w: str(plan(w).models[w.task].path),
     shell:
-        "python -m kibs_steps.models.contract {input:q} --task {wildcards.task} --out {output:q} > {log:q} 2>&1"
+        "python -m kibs_steps.models.contract {params.model:q} --task {wildcards.task} --out {output:q} > {log:q} 2>&1"
