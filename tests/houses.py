@@ -9,8 +9,10 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from kibs_steps import features, gate, solids, terrain
 from kibs_steps.ground import SECTIONS
 
+FLAT = terrain.flat(0.0)
 Section = tuple[list[tuple[float, float]], tuple[float, float, float]]
 
 BOX: list[Section] = [([(0, 0), (5, 0), (5, 4), (0, 4)], (0, 0, 3))]
@@ -166,3 +168,15 @@ def building_table(sections: list[Section], **how: object) -> pa.Table:
     smallest = min(table["section_id"].to_pylist())
     one = pa.array([smallest] * len(table), pa.int64())
     return table.append_column("building_id", one).append_column("cluster_id", one)
+
+
+def built(house, dtm=FLAT, **how):
+    """The one building of a house's table: sections, solid, attributes."""
+    ((building, sections),) = solids.clusters_of(building_table(house, **how))
+    solid = solids.build(sections, dtm)
+    return sections, solid, features.attributes(int(building[0]), sections, solid)
+
+
+def shells_are_valid(solid):
+    """Whether every shell of a solid passes the gate."""
+    return all(gate.check([s.rings for s in shell]) == [] for shell in solid.shells)

@@ -1,6 +1,5 @@
-"""Solids against closed form: volumes, types, ladders, courtyards, noise; every published shell passes the gate."""
+"""Solids against closed form: volumes, ladders, courtyards, noise; every published shell passes the gate."""
 
-import itertools
 import json
 from collections import Counter
 
@@ -11,26 +10,13 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 import toy_city
+from houses import FLAT, built, shells_are_valid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kibs_steps import clip, features, gate, shells, solids, store, terrain
-from kibs_steps.faces import Face
+from kibs_steps import features, gate, solids, store, terrain
 from kibs_steps.shells import GROUND, ROOF, WALL
 from kibs_steps.stitch import simplified
-
-FLAT = terrain.flat(0.0)
-
-
-def built(house, dtm=FLAT, **how):
-    """The one building of a house's table: sections, solid, attributes."""
-    ((building, sections),) = solids.clusters_of(houses.building_table(house, **how))
-    solid = solids.build(sections, dtm)
-    return sections, solid, features.attributes(int(building[0]), sections, solid)
-
-
-def shells_are_valid(solid):
-    return all(gate.check([s.rings for s in shell]) == [] for shell in solid.shells)
 
 
 @pytest.mark.parametrize("name", sorted(houses.VOLUME))
@@ -40,49 +26,6 @@ def test_volumes_are_those_of_closed_form(name, degrees):
     assert (row["lod"], row["lod_reason"], row["valid"]) == ("2.0", "", True)
     assert row["volume"] == pytest.approx(houses.VOLUME[name], rel=1e-3)
     assert shells_are_valid(solid)
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("box", "flat"),
-        ("shed", "shed"),
-        ("gable", "gable"),
-        ("hip", "hip"),
-        ("pyramid", "pyramid"),
-        ("with_wing", "complex"),
-    ],
-)
-def test_roof_types(name, kind):
-    assert built(houses.turned(houses.HOUSES[name], 37.0))[2]["roof_type"] == kind
-
-
-def test_two_slopes_falling_towards_each_other_are_no_gable():
-    butterfly = [(ring, (0, -b, 6 + 8 * b if b < 0 else 6)) for ring, (_, b, _) in houses.GABLE]
-    assert built(butterfly)[2]["roof_type"] == "complex"
-
-
-def test_the_type_of_a_roof_does_not_depend_on_ids():
-    """Slopes that face 0°, 20° and 40°: the middle one goes with either."""
-    facing = np.radians([0, 20, 40])
-    planes = np.array([(-0.5 * np.sin(a), -0.5 * np.cos(a), 5.0) for a in facing])
-    for wide in (4000, 5000, 6000):  # mm: the middle one is the smallest, as large as the others, the largest
-        ends = np.cumsum([0, 5000, wide, 5000])
-        squares = [[[(a, 0), (b, 0), (b, 5000), (a, 5000)]] for a, b in itertools.pairwise(ends.tolist())]
-        kinds = {
-            features.roof_type([Face(i, squares[k]) for i, k in enumerate(order)], planes[list(order)])
-            for order in itertools.permutations(range(3))
-        }
-        assert len(kinds) == 1
-
-
-def test_attributes_of_a_gable_house():
-    _, _, row = built(houses.GABLE, base=0.0)
-    assert (row["ground_z"], row["eave_z"], row["ridge_z"], row["height"]) == (0.0, 3.0, 6.0, 6.0)
-    assert (row["n_sections"], row["position_corrected"], row["footprint_area"]) == (2, True, 80.0)
-    assert row["footprint"].equals(shapely.box(500_000, 5_400_000, 500_010, 5_400_008))
-    assert row["outline"].geom_type == "MultiPolygon"
-    assert row["outline"].area == pytest.approx(80.0)
 
 
 def test_exact_sections_keep_every_vertex():
@@ -183,35 +126,6 @@ def test_parts_that_do_not_touch_are_building_parts():
     assert feature["CityObjects"]["building-1-2"]["parents"] == ["building-1"]
 
 
-def test_a_roof_that_dives_into_the_ground_ends_there():
-    steep = [([(0, 0), (10, 0), (10, 10), (0, 10)], (0, 0.8, -1.0))]
-    _, solid, row = built(steep)
-    assert row["lod"] == "2.0"
-    assert "section 1 comes down to -1.00 m above the ground" in row["lod_reason"]
-    assert row["eave_z"] == pytest.approx(0.5, abs=0.01)
-    assert row["volume"] == pytest.approx(10 * (7.0**2 - 0.5**2) / 1.6, rel=2e-3)
-    assert shells_are_valid(solid)
-
-
-def test_a_cut_roof_stands_on_the_ground_under_what_stays_of_it():
-    """On a hillside the lowest ground lies under the part that is cut off."""
-    hillside = terrain.Terrain(
-        np.tile(np.arange(200) * 0.3, (200, 1)), -10.25, 60.0, (0.5, 0.5)
-    )  # rises by 0.6 to the east
-    dives = solids.Sections(
-        np.array([1]), [shapely.box(0, 0, 10, 6)], np.array([[0.9, 0, 5.2]]), ["ok"], np.full(1, 0.1), (0, 0)
-    )
-    solid = solids.build(dives, hillside)
-    assert solid.lod == "2.0"
-    rim = shapely.get_coordinates(shapely.segmentize(solid.base, 0.1))
-    assert solid.ground / 1000 == pytest.approx(hillside(rim).min(), abs=0.002)
-    lowest = min(
-        z for shell in solid.shells for s in shell if s.kind == "RoofSurface" for ring in s.rings for *_, z in ring
-    )
-    assert lowest - solid.ground == pytest.approx(500, abs=2)
-    assert shells_are_valid(solid)
-
-
 def test_flat_ground_has_one_height_everywhere():
     """What is read between pixels of one height differs from it in the last digits."""
     for height in (97.3, 120.0):
@@ -219,55 +133,6 @@ def test_flat_ground_has_one_height_everywhere():
         corners = np.random.default_rng(0).uniform(50, 600, (60, 2))
         found = {solids.lowest_ground([shapely.box(x, y, x + 9.1, y + 7.7)], (0, 0), ground) for x, y in corners}
         assert found == {round(height * 1000)}
-
-
-def test_of_a_house_only_the_section_that_dives_is_cut():
-    house = [*houses.HIP, ([(14, 1), (22, 1), (22, 8), (14, 8)], (-0.5, 0, 10.8))]
-    _, solid, row = built(house)
-    assert row["lod"] == "2.0"
-    assert row["lod_reason"].startswith("2.0: section 5 comes down to")
-    assert row["volume"] == pytest.approx(houses.VOLUME["hip"] + 7 * (3.8**2 - 0.5**2) / 1.0, rel=2e-3)
-    assert row["footprint"].bounds[2] - 500_000 == pytest.approx(20.6, abs=0.02)
-    assert shells_are_valid(solid)
-
-
-def test_a_cut_may_leave_several_parts():
-    comb = shapely.box(0, 0, 12, 10) - shapely.box(3, -1, 5, 6) - shapely.box(7, -1, 9, 6)
-    sections = solids.Sections(np.array([1]), [comb], np.array([[0, 0.5, -0.5]]), ["ok"], np.full(1, 0.1), (0, 0))
-    solid = solids.build(sections, FLAT)
-    assert solid.lod == "2.0"
-    assert shells_are_valid(solid)
-    assert solid.base.bounds[1] == pytest.approx(2.0, abs=0.01)
-
-
-def test_neighbours_that_both_dive_are_both_cut():
-    """Two faces share an edge at different heights: each is cut where its own plane comes down, whichever is first."""
-    squares = [
-        [(0, 0), (10_000, 0), (10_000, 10_000), (0, 10_000)],
-        [(10_000, 0), (20_000, 0), (20_000, 10_000), (10_000, 10_000)],
-    ]
-    both = [Face(k, [ring]) for k, ring in enumerate(squares)]
-    planes = np.array([[0, 0.1, 0.2], [0, 0.1, 0.1]])
-    for order in (both, both[::-1]):
-        for face in clip.clipped(order, planes, {0, 1}, 500):
-            assert min(shells.height(planes[face.section], p) for p in face.rings[0]) >= 499
-
-
-def test_a_roof_mostly_below_ground_is_made_level_and_told():
-    house = [*houses.HIP, ([(14, 1), (22, 1), (22, 8), (14, 8)], (-2.0, 0, 33.0))]
-    _, solid, row = built(house)
-    assert row["lod"] == "2.0"
-    assert "of a section would lie below the ground" in row["lod_reason"]
-    assert row["eave_z"] == pytest.approx(0.5, abs=0.01)
-    assert shells_are_valid(solid)
-
-
-def test_a_roof_wholly_below_ground_stays_as_a_footprint():
-    _, solid, row = built([(ring, (0, 0, -2.0)) for ring, _ in houses.BOX])
-    assert (row["lod"], row["valid"], solid.shells) == ("0", False, [])
-    assert row["footprint"].area == pytest.approx(20.0)
-    assert (row["volume"], row["height"], row["roof_type"]) == (None, None, None)
-    assert "above the ground" in row["lod_reason"]
 
 
 def test_level_placeholders_alone_are_no_lod2():
@@ -484,29 +349,3 @@ def test_a_gap_between_drawn_sections_is_closed_only_where_a_step_hid_it(seen, a
     footprint = sum(shapely.area(shapely.get_parts(one.base)))
     assert footprint == pytest.approx(200.0 + (10 * apart if closed else 0.0), abs=0.1)
     assert shells_are_valid(one)
-
-
-def test_a_buildings_uncertainty_is_that_of_its_sections_by_area():
-    large, small = shapely.box(0, 0, 9, 8), shapely.box(9, 0, 12, 8)
-    flat = np.array([[0, 0, 4.0], [0, 0, 6.5]])
-    sections = solids.Sections(
-        np.array([1, 2]), [large, small], flat, ["ok"] * 2, np.array([0.2, 0.6]), (0, 0), spread=np.array([0.4, 1.2])
-    )
-    solid = solids.build(sections, FLAT)
-    row = features.attributes(1, sections, solid)
-    assert (row["height_sigma"], row["position_sigma"], row["position_corrected"]) == (0.3, 0.6, True)
-    unknown = features.attributes(1, sections._replace(spread=np.full(2, np.nan)), solid)
-    assert (unknown["position_sigma"], unknown["position_corrected"]) == (None, False)
-
-
-def test_roof_surfaces_say_how_they_lie():
-    """A gable's two slopes fall north and south of the grid, which is turned against true north by 1.5°."""
-    sections, solid, row = built(houses.GABLE)
-    line = features.feature(row, sections, solid, (500_000, 5_400_000), 1.5)
-    (geometry,) = line["CityObjects"]["building-1"]["geometry"]
-    roofs = {s["section_id"]: s for s in geometry["semantics"]["surfaces"] if s["type"] == "RoofSurface"}
-    for number, (ring, (_, b, _)) in enumerate(houses.GABLE, start=1):
-        slope = np.arctan(abs(b))
-        assert roofs[number]["slope"] == pytest.approx(np.degrees(slope), abs=0.01)
-        assert roofs[number]["azimuth"] == (1.5 if b < 0 else 181.5)
-        assert roofs[number]["area"] == pytest.approx(shapely.Polygon(ring).area / np.cos(slope), abs=0.01)

@@ -11,7 +11,6 @@ In: a dense model for sections with its contract; simulated scenes at the direct
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from kibs_steps import cli, photographs, store
+from kibs_steps import cli, photographs
 from kibs_steps.errors import KibsError
 from kibs_steps.learn import augmentation, calibration, dataset, fitting, sources
 from kibs_steps.learn.samples import Sample
@@ -157,8 +156,6 @@ def scene(contract: dict[str, Any], number: int, stock: Stock = NOTHING) -> Samp
 
 def main(argv: list[str] | None = None) -> None:
     """Learn how a model's basins are joined to sections, and write it into the model."""
-    import onnx
-
     parser = argparse.ArgumentParser(prog="python -m kibs_steps.learn.joins", description=main.__doc__)
     parser.add_argument("--model", required=True, help="ONNX file of a dense model for sections, or both; gets `join`")
     parser.add_argument("--scenes", type=int, default=120, help="simulated scenes of a tile each to learn from")
@@ -201,10 +198,7 @@ def main(argv: list[str] | None = None) -> None:
         print(f"{args.model} stays as it is: {error}")
         return
     contract["score"] = calibration.score(zip(maps, samples, strict=True), contract)
-    proto = onnx.load(args.model)
-    onnx.helper.set_model_props(proto, {contracts.KEY: json.dumps(contracts.validate(contract, args.model))})
-    with store.whole(args.model, summed=False) as temporary:
-        onnx.save(proto, str(temporary))
+    contracts.write(args.model, contract)
     print(f"{args.model}: joins learned on {len(samples)} scenes")
 
 

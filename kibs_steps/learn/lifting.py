@@ -8,7 +8,6 @@ walls are seen clearly, too. Out: the contract's `walls`, in the file.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -19,7 +18,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from kibs_steps import cli, store
+from kibs_steps import cli
 from kibs_steps.blend import blend
 from kibs_steps.learn import augmentation, dataset, examples, sources, targets
 from kibs_steps.learn.fitting import rounded
@@ -198,13 +197,8 @@ def main(argv: list[str] | None = None) -> None:
     if sections < FEW:
         print(f"{args.model} stays as it is: {len(found) // 2} tiles with {sections // 2} sections teach nothing")
         return
-    contract = {
-        **model.contract,
-        "walls": learned(Lesson(*(np.concatenate(parts) for parts in zip(*found, strict=True)))),
-    }
-    onnx.helper.set_model_props(proto, {contracts.KEY: json.dumps(contracts.validate(contract, args.model))})
-    with store.whole(args.model, summed=False) as temporary:
-        onnx.save(proto, str(temporary))
+    taught = Lesson(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    contracts.write(args.model, {**model.contract, "walls": learned(taught)})
     print(f"{args.model}: lifts learned on {len(found) // 2} tiles")
 
 

@@ -161,6 +161,16 @@ def load(path: str | Path, task: str | None = None) -> Model:
     return Model(path, hashlib.sha256(data).hexdigest(), contract)
 
 
+def write(path: str | Path, contract: dict[str, Any]) -> None:
+    """Give the model in an ONNX file another contract. Raises `ContractMismatch` for one that is none."""
+    import onnx
+
+    proto = onnx.load(str(path))
+    onnx.helper.set_model_props(proto, {KEY: json.dumps(validate(contract, str(path)))})
+    with store.whole(path, summed=False) as temporary:
+        onnx.save(proto, str(temporary))
+
+
 def _external(graph: Any) -> Iterator[str]:
     """Names of the files in which a graph, or one inside it, keeps tensors."""
     from onnx.external_data_helper import uses_external_data
