@@ -33,6 +33,7 @@ from kibs_steps.terrain import Terrain
 
 FITTED = ("ok", "raster_edge", "cloud_or_nodata")  # statuses whose plane was fitted to enough corners
 LOWEST_ROOF = 0.5  # m above the building's ground
+TIDIED = 40  # mm, how much lower a cut roof may end once its short edges are drawn together
 RAGGED = 1.3  # px, how far the rim of a traced section may be from its straight edge
 DRAWN = 0.3  # m, how well drawn outlines fit each other
 MEETING = 1.5  # px, outlines this near in the image meet there
@@ -287,7 +288,7 @@ def _clipped(roof: Roof, origin: tuple[int, int], dtm: Terrain) -> Roof:
     """The roof cut where it comes down to the ground that lies under what stays of it. Raises `Refused` if it nowhere does."""
     whole = roof
     while low := {f.section for f in roof.faces if _above(roof, f) < LOWEST_ROOF * MM}:
-        faces = straight.tidied(clip.clipped(roof.faces, roof.planes, low, roof.ground + round(LOWEST_ROOF * MM)))
+        faces = _cut(roof, low)
         ground = lowest_ground(shapes_of(faces), origin, dtm)
         if ground <= roof.ground:
             return roof._replace(faces=faces)
@@ -295,6 +296,17 @@ def _clipped(roof: Roof, origin: tuple[int, int], dtm: Terrain) -> Roof:
     if roof is whole:
         raise Refused("no section comes down to the ground")
     return roof
+
+
+def _cut(roof: Roof, low: set[int]) -> list[Face]:
+    """Its faces, those of sections in `low` cut where they come down to the lowest height; a little higher where tidying would
+    take them below it again."""
+    for spare in (0, TIDIED):
+        lowest = roof.ground + round(LOWEST_ROOF * MM) + spare
+        faces = straight.tidied(clip.clipped(roof.faces, roof.planes, low, lowest))
+        if all(_above(roof, face) >= LOWEST_ROOF * MM for face in faces):
+            break
+    return faces
 
 
 def _above(roof: Roof, face: Face) -> int:

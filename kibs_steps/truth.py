@@ -214,7 +214,8 @@ def _cells(polygons: NDArray[np.object_]) -> Iterator[NDArray[np.int64]]:
 def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
     """`truth.parquet` of a layer: the sections whose seen outline touches the grid.
 
-    Raises `NoHeights` where z is missing or cannot be meant as `vertical` says, `NoOverlap` where nothing lies in the scene.
+    Raises `NoHeights` where z is missing or cannot be meant as `vertical` and `frame` say, `NoOverlap` where nothing lies in the
+    scene.
     """
     if not shapely.has_z(layer.polygons).all():
         flat = int((~shapely.has_z(layer.polygons)).sum())
@@ -229,6 +230,13 @@ def table(layer: Layer, scene: Scene, frame: str, vertical: str) -> pa.Table:
     if rows.size:
         _plausible(shapely.get_coordinates(seen, include_z=True)[:, 2], layer.name, vertical)
     shown = _meets(shapely.bounds(seen), (0.0, 0.0, grid.width, grid.height), 0.0)
+    if not shown.any() and _meets(shapely.bounds(polygons), grid.bounds, 0.0).any():
+        height = float(np.median(shapely.get_coordinates(seen, include_z=True)[:, 2]))
+        raise NoHeights(
+            f"truth layer {layer.name} lies in the scene, but moved by its heights, {height:.0f} m above the ground in the "
+            f"median with z read as '{vertical}' and outlines as where roofs are in the '{frame}', none of it is seen there: "
+            "check truth_z and truth_frame"
+        )
     if not shown.any():
         extent, scene_extent = (
             ", ".join(f"{v:.0f}" for v in bounds) for bounds in (shapely.total_bounds(polygons), grid.bounds)

@@ -86,3 +86,13 @@ def test_a_roof_wholly_below_ground_stays_as_a_footprint():
     assert row["footprint"].area == pytest.approx(20.0)
     assert (row["volume"], row["height"], row["roof_type"]) == (None, None, None)
     assert "above the ground" in row["lod_reason"]
+
+
+def test_a_cut_roof_whose_short_edges_are_drawn_together_stays_above_the_ground():
+    """Cut at the lowest height, this one ended 2 mm below it once tidied, and was made level."""
+    dives = [(-5.41, -5.95), (-3.78, 2.03), (-7.38, 5.98), (1.73, 2.56), (-4.17, -6.17)]
+    beside = [(5.5, 1.15), (7.74, -0.52), (5.58, -4.97), (1.1, -7.09), (-4.17, -6.17), (1.73, 2.56)]
+    _, solid, row = built([(dives, (-0.925, 0.434, -0.687)), (beside, (0, 0, 6.0))])
+    assert row["lod_reason"] == "2.0: section 1 comes down to -1.18 m above the ground"
+    assert row["faithful"] == 1.0
+    assert shells_are_valid(solid)

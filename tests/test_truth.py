@@ -194,6 +194,19 @@ def test_what_is_wrong_with_a_layer_is_said(tmp_path):
         read(write_layer(tmp_path / "high.gpkg", [high]), scene, z="above_ground")
 
 
+def test_heights_that_move_all_truth_out_of_the_scene_are_told(tmp_path):
+    """Roofs of 330 m above the sea on ground of 320 m, in a raster of 76 m: read as heights above ground they leave it."""
+    image = rasters.write(tmp_path / "r.tif", rasters.picture(height=200, width=200))
+    scene, _ = rasters.build(tmp_path, image, "320", view=(180.0, 60.0))
+    seen = scene.grid.to_map(np.array([[80.0, 80.0], [120.0, 80.0], [120.0, 120.0], [80.0, 120.0]]))
+    layer = write_layer(
+        tmp_path / "t.gpkg", [shapely.Polygon(np.column_stack([seen, np.full(4, 330.0)]))], crs=scene.grid.crs
+    )
+    with pytest.raises(truth.NoHeights, match=r"330 m above the ground .*check truth_z"):
+        read(layer, scene, z="above_ground")
+    assert len(read(layer, scene, z="absolute")[0]) == 1
+
+
 def test_geojson_and_shapefile_are_read(tmp_path):
     scene = toy.make_scene(tmp_path / "scene")
     outlines = [outline for _, _, outline in toy.roofs()]
