@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from itertools import pairwise
 from math import hypot
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -39,6 +40,15 @@ SMALLEST = 0.25  # m², no face is made smaller
 CLEARANCE = 0.02  # m, a vertex this near to an edge is made part of it
 TINY = 0.01  # m, shortest edge of any partition
 COLLINEAR = 0.002  # m, a vertex this near to the line between its neighbours says nothing
+APART = 0.25  # sine of the angle between two lines that meet in a corner
+
+
+class Piece(NamedTuple):
+    """A straight piece of rim: the path (mm) that its line is fitted to, and the vertices between which it runs."""
+
+    path: list[Point]
+    start: Point
+    end: Point
 
 
 def ragged(faces: list[Face], reach: float = REACH, building: np.ndarray | None = None) -> list[Face]:
@@ -61,17 +71,18 @@ def tidied(faces: list[Face]) -> list[Face]:
 def _straight(faces: list[Face], reach: float, building: np.ndarray | None) -> list[Face] | None:
     """Faces whose rims are straight within `reach` (m), or None if they would no longer tile.
 
-    Each chain of edges between two junctions is cut by Douglas and Peucker; to each piece a line is fitted over all of the chain
-    that it replaces; each vertex goes to where the lines of its pieces meet. Faces that this breaks stay as they are.
+    Each chain of edges between two junctions is cut by Douglas and Peucker, and corners that this cuts off are put back; to each
+    piece a line is fitted over all of the chain that it replaces; each vertex goes to where the lines of its pieces meet. Faces
+    that this breaks stay as they are.
     """
-    pieces = [piece for chain in _chains(faces) for piece in _pieces(chain, reach)]
+    pieces = _pieces(faces, reach)
     owner = _owners(pieces, faces, building)
     main = {o: _main_direction([p for p, own in zip(pieces, owner, strict=True) if own == o]) for o in set(owner)}
     stiff: dict[Point, np.ndarray] = {}
     pull: dict[Point, np.ndarray] = {}
     for piece, own in zip(pieces, owner, strict=True):
-        normal, offset, weight = _line(piece, main[own], reach)
-        for point in (piece[0], piece[-1]):
+        normal, offset, weight = _line(piece.path, main[own], reach)
+        for point in (piece.start, piece.end):
             place = np.array(point) / MM
             stiff.setdefault(point, ANCHOR * np.eye(2))
             pull.setdefault(point, ANCHOR * place)
@@ -93,13 +104,13 @@ def _straight(faces: list[Face], reach: float, building: np.ndarray | None) -> l
     return None
 
 
-def _owners(pieces: list[list[Point]], faces: list[Face], building: np.ndarray | None) -> list[int]:
+def _owners(pieces: list[Piece], faces: list[Face], building: np.ndarray | None) -> list[int]:
     """The building that each piece of rim belongs to; of two, the first."""
     if building is None:
         return [0] * len(pieces)
     edges = directed_edges(faces)
     owners = []
-    for u, v, *_ in pieces:
+    for (u, v, *_), *_ in pieces:
         beside = [edges[e] for e in ((u, v), (v, u)) if e in edges]
         owners.append(min(int(building[faces[f].section]) for f in beside))
     return owners
@@ -114,9 +125,8 @@ def _around(faces: list[Face]) -> dict[Point, list[Point]]:
     return around
 
 
-def _chains(faces: list[Face]) -> Iterator[list[Point]]:
-    """The edges of all faces as paths between junctions (vertices with other than two edges), each once; loops in two halves."""
-    around = _around(faces)
+def _chains(around: dict[Point, list[Point]]) -> Iterator[list[Point]]:
+    """Edges as paths between junctions (vertices with other than two edges), each once; loops end where they begin."""
     left = {(u, v) for u in around for v in around[u]}
 
     def follow(u: Point, v: Point) -> list[Point]:
@@ -131,16 +141,23 @@ def _chains(faces: list[Face]) -> Iterator[list[Point]]:
         for u in sorted(around):
             for v in around[u] if junctions == (len(around[u]) != 2) else []:
                 if (u, v) in left:
-                    chain = follow(u, v)
-                    if chain[0] != chain[-1]:
-                        yield chain
-                    else:
-                        far = max(range(len(chain)), key=lambda k: hypot(chain[k][0] - u[0], chain[k][1] - u[1]))
-                        yield chain[: far + 1]
-                        yield chain[far:]
+                    yield follow(u, v)
 
 
-def _pieces(chain: list[Point], reach: float) -> list[list[Point]]:
+def _pieces(faces: list[Face], reach: float) -> list[Piece]:
+    """The rims of faces as straight pieces, chain by chain."""
+    around = _around(faces)
+    found = []
+    for chain in _chains(around):
+        start, loop = chain[0], chain[0] == chain[-1]
+        far = max(range(len(chain)), key=lambda k: hypot(chain[k][0] - start[0], chain[k][1] - start[1]))
+        halves = [chain[: far + 1], chain[far:]] if loop else [chain]
+        pieces = [Piece(path, path[0], path[-1]) for half in halves for path in _cut(half, reach)]
+        found += _with_corners(pieces, loop and len(around[start]) == 2, reach)
+    return found
+
+
+def _cut(chain: list[Point], reach: float) -> list[list[Point]]:
     """A chain cut where it leaves its chord by more than `reach` (m)."""
     kept = shapely.get_coordinates(shapely.simplify(shapely.LineString(chain), reach * MM, preserve_topology=False))
     cuts, k = [], 0
@@ -152,25 +169,64 @@ def _pieces(chain: list[Point], reach: float) -> list[list[Point]]:
     return [chain[a : b + 1] for a, b in pairwise(cuts)]
 
 
-def _main_direction(pieces: list[list[Point]]) -> float | None:
+def _with_corners(pieces: list[Piece], loop: bool, reach: float) -> list[Piece]:
+    """The pieces of a chain without those that cut a corner off: shorter than both of their neighbours, whose lines meet in a
+    corner that does as well within `reach` (m). The shortest goes first; of a `loop` any may go, else neither end's."""
+    while len(pieces) > (3 if loop else 2):
+        among = range(len(pieces)) if loop else range(1, len(pieces) - 1)
+        for k in sorted(among, key=lambda k: _chord(pieces[k].path)):
+            before, cut, after = pieces[k - 1], pieces[k], pieces[(k + 1) % len(pieces)]
+            corner = _corner(before, cut, after, reach)
+            if corner is not None:
+                pieces = list(pieces)
+                pieces[k - 1], pieces[(k + 1) % len(pieces)] = before._replace(end=corner), after._replace(start=corner)
+                del pieces[k]
+                break
+        else:
+            break
+    return pieces
+
+
+def _corner(before: Piece, cut: Piece, after: Piece, reach: float) -> Point | None:
+    """The vertex of a piece that is nearest to where its neighbours' lines meet, if these do in its place."""
+    if _chord(cut.path) > min(_chord(before.path), _chord(after.path)):
+        return None
+    (one, off, _), (other, away, _) = (_line(piece.path, None, reach) for piece in (before, after))
+    if abs(one[0] * other[1] - one[1] * other[0]) < APART:
+        return None
+    corner = np.linalg.solve([one, other], [off, away])
+    vertices = np.array(cut.path, float) / MM
+    distance = np.hypot(*(vertices - corner).T)
+    instead = shapely.LineString([np.array(before.start) / MM, corner, np.array(after.end) / MM])
+    if distance.min() > 2 * reach or shapely.distance(shapely.points(vertices), instead).max() > reach:
+        return None
+    return cut.path[int(distance.argmin())]
+
+
+def _chord(path: list[Point]) -> float:
+    """The length (m) from a path's start to its end."""
+    return hypot(path[-1][0] - path[0][0], path[-1][1] - path[0][1]) / MM
+
+
+def _main_direction(pieces: list[Piece]) -> float | None:
     """The building's main direction (rad, modulo a right angle), None where it has none."""
-    chords = np.array([np.subtract(piece[-1], piece[0]) for piece in pieces], float) / MM
+    chords = np.array([np.subtract(piece.path[-1], piece.path[0]) for piece in pieces], float) / MM
     square = (chords**2).sum(axis=1)
     square[square < LONG**2] = 0.0
     turns = (square * np.exp(4j * np.arctan2(chords[:, 1], chords[:, 0]))).sum()
     return float(np.angle(turns) / 4) if abs(turns) > 0.5 * square.sum() > 0 else None
 
 
-def _line(piece: list[Point], main: float | None, reach: float) -> tuple[np.ndarray, float, float]:
-    """Normal, offset (m) and weight (m) of the line through a piece, turned into a main direction that is near."""
-    path = np.array(piece, float) / MM
-    edge, middle = np.diff(path, axis=0), (path[1:] + path[:-1]) / 2
+def _line(path: list[Point], main: float | None, reach: float) -> tuple[np.ndarray, float, float]:
+    """Normal, offset (m) and weight (m) of the line through a path, turned into a main direction that is near."""
+    at = np.array(path, float) / MM
+    edge, middle = np.diff(at, axis=0), (at[1:] + at[:-1]) / 2
     length = np.hypot(*edge.T)
     centre = (middle * length[:, None]).sum(axis=0) / length.sum()
     away = middle - centre
     spread = np.einsum("i,ij,ik->jk", length, away, away) + np.einsum("i,ij,ik->jk", length / 12, edge, edge)
     along = np.linalg.eigh(spread)[1][:, 1]
-    chord = np.hypot(*(path[-1] - path[0]))
+    chord = _chord(path)
     if main is not None:
         angle = np.arctan2(along[1], along[0]) - main
         off = angle - np.round(angle / (np.pi / 2)) * (np.pi / 2)

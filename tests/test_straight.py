@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 import shapely
+from rasterio import features
 
 from kibs_steps import straight
-from kibs_steps.faces import Face, is_coverage, polygon
+from kibs_steps.faces import MM, Face, is_coverage, polygon
+
+GSD = 0.38
 
 
 def staircase(length, step, rise):
@@ -53,6 +56,46 @@ def test_a_courtyard_and_what_fills_a_hole_survive():
     assert is_coverage(faces)
     assert [len(f.rings) for f in faces] == [3, 1]
     assert sum(polygon(f).area for f in faces) == pytest.approx(400 - 16)
+
+
+def house(rng):
+    """A rectangle, or an L, of 5 to 20 m at any angle: polygon (m)."""
+    length, width = rng.uniform(5, 20), rng.uniform(4, 12)
+    whole = shapely.box(0, 0, length, width)
+    yard = shapely.box(length * rng.uniform(0.4, 0.7), width * rng.uniform(0.4, 0.6), length + 1, width + 1)
+    shape = whole if rng.random() < 0.5 else whole - yard
+    turned = shapely.affinity.rotate(shape, rng.uniform(0, 90), origin="centroid")
+    return shapely.affinity.translate(turned, *rng.uniform(10, 12, 2))
+
+
+def as_pixels(shape):
+    """The face of the pixels (of `GSD`) whose middles lie in a polygon (m)."""
+    pixels = features.rasterize(
+        [(shapely.affinity.scale(shape, 1 / GSD, 1 / GSD, origin=(0, 0)), 1)], (90, 90), dtype="uint8"
+    )
+    ((traced, _),) = features.shapes(pixels, mask=pixels == 1)
+    ring = shapely.orient_polygons(shapely.geometry.shape(traced)).exterior.coords[:-1]
+    return Face(0, [[(round(x * GSD * MM), round(y * GSD * MM)) for x, y in ring]])
+
+
+def test_houses_traced_at_any_angle_get_their_own_corners_and_no_more():
+    """Short edges that cut a corner off, left by steps of pixels, are not taken for edges of the house."""
+    right, overlap = [], []
+    for seed in range(60):
+        shape = house(np.random.default_rng(seed))
+        (face,) = straight.ragged([as_pixels(shape)], 1.3 * GSD)
+        right.append(len(face.rings[0]) == len(shape.exterior.coords) - 1)
+        overlap.append(polygon(face).intersection(shape).area / polygon(face).union(shape).area)
+    assert np.mean(right) > 0.9
+    assert np.mean(overlap) > 0.97
+
+
+def test_a_corner_cut_off_by_more_than_the_rim_may_move_stays_cut():
+    cut = [(0, 0), (12000, 0), (12000, 6000), (10000, 8000), (0, 8000)]
+    (face,) = straight.ragged([Face(0, [cut])], 0.5)
+    assert shapely.equals_exact(
+        shapely.normalize(polygon(face)), shapely.normalize(shapely.Polygon(np.array(cut) / MM)), 0.05
+    )
 
 
 def test_tidied_leaves_exact_faces_alone():
