@@ -48,6 +48,10 @@ onsuccess:
     for p in PLANS.values():
         if not p.left_out:
             failures.settle(RESULTS / p.name)
+        if old := left_behind(p):
+            logger.warning(
+                f"{p.name}: {', '.join(old)} of an earlier run, not made anew, may tell of another city than the rest"
+            )
 
 
 onerror:

@@ -147,9 +147,13 @@ def test_another_corner_model_reruns_corners_only(copy):
 
 
 def test_another_view_reruns_from_the_planes(copy):
-    done = jobs(run(copy, view_azimuth=95))
+    (copy / "results/town/report.html").touch()
+    told = run(copy, view_azimuth=95)
+    done = jobs(told)
     assert {"scene", "planes", "ground"} <= set(done)
     assert not {"tiles", "sections", "blend", "corners", "stitch"} & set(done)
+    assert "town: report.html of an earlier run, not made anew" in told
+    assert "not made anew" not in run(copy, only=["report.html"], view_azimuth=95)
 
 
 def test_another_terrain_reruns_from_the_planes(copy):

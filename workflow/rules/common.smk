@@ -239,6 +239,19 @@ def published(p):
     return [f"results/{p.name}/{f}" for f in names]
 
 
+def left_behind(p):
+    """Files about a scene that are older than its city, and that the present settings do not ask for."""
+    asked, record = published(p), RESULTS / p.name / "run.json"
+    about = ["evaluation.json", "evaluation.png", "paper.tif", "report.html"]
+    there = [
+        record.with_name(f)
+        for f in about
+        if f"results/{p.name}/{f}" not in asked and record.with_name(f).exists()
+    ]
+    made = record.stat().st_mtime if record.exists() else 0
+    return [path.name for path in there if path.stat().st_mtime < made]
+
+
 def kept(p):
     """The files of every block that stay on disk: one that is missing is made again."""
     detected = (
