@@ -92,7 +92,9 @@ def changes(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[s
     for o, n in together:
         a, b = (shapely.get_coordinates(shapely.centroid(s[k]))[0] for s, k in zip(shapes, (o, n), strict=True))
         offset = float(np.hypot(*(b - a)))
-        rows.append(_row(compared(old[o], new[n], offset), old[o], new[n], offset))
+        small, large = sorted((shapes[0][o].area, shapes[1][n].area))
+        moved = offset if small >= ALIKE * large else 0.0  # the middle of a part is another one, though nothing moved
+        rows.append(_row(compared(old[o], new[n], moved), old[o], new[n], offset))
     rows += [_row("gone", old[o], None, None) for o in sorted(set(range(len(old))) - {o for o, _ in together})]
     rows += [_row("new", None, new[n], None) for n in sorted(set(range(len(new))) - {n for _, n in together})]
     return rows
@@ -197,7 +199,9 @@ def _write_layer(path: Path, rows: list[dict[str, Any]], crs: str) -> None:
     import geopandas
 
     def areas(shape: shapely.Geometry) -> shapely.MultiPolygon:
-        return shapely.MultiPolygon([p for p in shapely.get_parts(shape) if p.geom_type == "Polygon"])
+        return shapely.MultiPolygon(
+            [p for p in shapely.get_parts(shapely.get_parts(shape)) if p.geom_type == "Polygon"]
+        )
 
     shapes = [areas(row["geometry"]) for row in rows]
     names = [k for k in (rows[0] if rows else {"change": ""}) if k != "geometry"]

@@ -29,8 +29,10 @@ from kibs_steps.stitch import SECTIONS, distinct_corners, owner_blocks, section_
 LAYER = "roof_sections_image"
 PUBLISHED = "roof_sections"  # the other layer of `city.gpkg` that has sections, where they stand
 UNREADABLE = "sections {path} cannot be read ({error}): give the edited city.gpkg or a GeoPackage"
+ELSEWHERE = "sections {path} lie outside the raster, which is in {crs}: check the layer's CRS, and that it belongs to the raster"
 EMPTY_LAYER = f"sections {{path}} holds no polygons: give the layer {LAYER} as edited"
 SAME = 0.01  # px: an outline that moved less was not touched, but perhaps saved in another CRS
+ALIKE = 0.8  # of what an outline and its former one cover together both must, or heights over the former say nothing
 
 
 class SectionsUnusable(KibsError):
@@ -38,10 +40,11 @@ class SectionsUnusable(KibsError):
 
 
 def layer_of(path: str | Path) -> str | None:
-    """The layer that holds the sections: that of `city.gpkg`, else a file's first."""
+    """The layer that holds the sections: that of `city.gpkg`, else a file's first of polygons, or its first of any kind."""
     import pyogrio
 
-    return LAYER if LAYER in [str(name) for name, _ in pyogrio.list_layers(path)] else None
+    layers = {str(name): str(kind) for name, kind in pyogrio.list_layers(path)}
+    return LAYER if LAYER in layers else next((name for name, kind in layers.items() if "Polygon" in kind), None)
 
 
 def _say_which(path: str | Path) -> None:
@@ -61,7 +64,10 @@ def _say_which(path: str | Path) -> None:
 
 
 def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Ids (n,), 0 where there is none, and outlines (n,) in image coordinates (px). Raises `SectionsUnusable`."""
+    """Ids (n,), 0 where there is none, and outlines (n,) in image coordinates (px): those that meet the raster.
+
+    Raises `SectionsUnusable`.
+    """
     import geopandas
     import pandas as pd
     import pyogrio
@@ -71,6 +77,8 @@ def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         frame = geopandas.read_file(path, layer=layer_of(path))
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
         raise SectionsUnusable(UNREADABLE.format(path=path, error=error)) from error
+    if "geometry" not in frame:
+        raise SectionsUnusable(EMPTY_LAYER.format(path=path))
     rows = len(frame)
     frame["row"] = np.arange(rows)
     # Parts of collections too, which editing may leave, and of what is in them.
@@ -83,18 +91,34 @@ def read(path: str | Path, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     frame = frame.to_crs(grid.crs)
     own = pd.to_numeric(frame["section_id"], errors="coerce") if "section_id" in frame else pd.Series(0, frame.index)
     ids = own.fillna(0).clip(0, 2**62).astype(np.int64).to_numpy()
-    outlines = shapely.transform(shapely.force_2d(frame.geometry.to_numpy()), grid.to_image)
+    outlines = shapely.transform(shapely.force_2d(frame.geometry.to_numpy()), lambda xy: _at_corners(grid.to_image(xy)))
     outlines = np.array([_polygon(g) for g in outlines], object)
     usable = np.array([g is not None for g in outlines])
     if not usable.any():
         raise SectionsUnusable(EMPTY_LAYER.format(path=path))
     if lost := rows - frame["row"][usable].nunique():
         print(f"warning: sections {path}: {lost} of {rows} rows have no area and are left out", file=sys.stderr)
-    return ids[usable], outlines[usable]
+    ids, outlines = ids[usable], outlines[usable]
+    shown = shapely.intersects(outlines, shapely.box(0, 0, grid.width, grid.height))
+    if not shown.any():
+        raise SectionsUnusable(ELSEWHERE.format(path=path, crs=grid.crs.splitlines()[0]))
+    if lost := int((~shown).sum()):
+        print(f"warning: sections {path}: {lost} outlines lie outside the raster and are left out", file=sys.stderr)
+    return ids[shown], outlines[shown]
+
+
+def _at_corners(pixels: np.ndarray) -> np.ndarray:
+    """Places (n, 2 px), those exactly at pixels' corners that a way through map coordinates moved from there by less than
+    `SAME`: by them traced outlines are told from drawn ones."""
+    corners = np.round(pixels)
+    return np.where(np.abs(pixels - corners) < SAME, corners, pixels)
 
 
 def _polygon(outline: shapely.Geometry) -> shapely.Geometry | None:
-    """A valid polygon of an outline drawn by hand: the largest part where it crosses itself."""
+    """A valid polygon of an outline drawn by hand: the largest part where it crosses itself; none of coordinates that are no
+    numbers."""
+    if not np.isfinite(shapely.get_coordinates(outline)).all():
+        return None
     if outline.is_valid:
         return outline if outline.area > 0 else None
     mended = shapely.make_valid(outline, method="structure", keep_collapsed=False)
@@ -130,13 +154,19 @@ def same(one: shapely.Geometry, other: shapely.Geometry) -> bool:
     return sorted(counts[0]) == sorted(counts[1]) and bool(shapely.hausdorff_distance(one, other) < SAME)
 
 
+def _alike(one: shapely.Geometry, other: shapely.Geometry) -> bool:
+    """Whether two outlines cover nearly the same."""
+    both = shapely.area(shapely.intersection(one, other))
+    return bool(both >= ALIKE * (shapely.area(one) + shapely.area(other) - both))
+
+
 def edited(
     ids: np.ndarray, outlines: np.ndarray, before: pa.Table, corners: pa.Table, grid: Grid
 ) -> tuple[pa.Table, pa.Table]:
     """Sections after `stitch.SECTIONS`, by id, and the corners; `before` is what was stitched.
 
-    Corners that belonged to a section that was touched are free again, and the height map's sums over its old outline are gone;
-    how far walls lift it stays.
+    Corners that belonged to a section that was touched are free again, and the height map's sums over its old outline are gone
+    unless the new one is much like it (`ALIKE`); how far walls lift it stays.
     """
     row_of = {section: k for k, section in enumerate(before["section_id"].to_pylist())}
     old = shapely.from_wkb(before["outline"].to_numpy(zero_copy_only=False))
@@ -156,7 +186,8 @@ def edited(
         found |= {"edge": bool(edge[k]), "void": False, "owner": 0, "sums": EMPTY}
         if row is not None:
             found |= {name: column[name][row] for name in ("score", "split", "void")}
-            found["sums"] = [*EMPTY[:LIFT], *column["sums"][row][LIFT:]]
+            heights = column["sums"][row][:LIFT] if _alike(old[row], outlines[k]) else EMPTY[:LIFT]
+            found["sums"] = [*heights, *column["sums"][row][LIFT:]]
         if not touched[k]:
             found = {name: column[name][row] for name in SECTIONS.names}
         for name, value in found.items():
@@ -177,6 +208,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--tile", type=int, required=True, help="tile side, px")
     parser.add_argument("--margin", type=int, required=True, help="tile margin, px")
     parser.add_argument("--block", type=int, required=True, help="block side in tiles")
+    parser.add_argument("--left-out", nargs="*", default=[], help="blocks that the city is made without")
     parser.add_argument("--reach", type=float, required=True, help="how far corners may lie from their section, px")
     parser.add_argument("--sections", required=True, help="out: sections of all blocks")
     parser.add_argument("--corners", required=True, help="out: corners of all blocks")
@@ -197,6 +229,11 @@ def main(argv: list[str] | None = None) -> None:
             np.unique(tree.query(outlines[mine], predicate="dwithin", distance=args.reach)[1]) if len(mine) else mine
         )
         near[block.name] = corners.take(pa.array(reached))
+    if lost := {name: len(by_block[name]) for name in args.left_out if len(by_block[name])}:
+        print(
+            f"warning: sections {args.layer}: {sum(lost.values())} in {', '.join(lost)} are left out, as these blocks failed",
+            file=sys.stderr,
+        )
     store.write_by_block(args.sections, by_block)
     store.write_by_block(args.corners, near)
 

@@ -84,7 +84,7 @@ def check(plan: Plan, results: Path) -> list[str]:
     if settings.get("footprints"):
         check_footprints(settings["footprints"])
     if settings.get("sections"):
-        check_sections(settings["sections"])
+        check_sections(settings["sections"], grid)
     return [doubt for doubt in doubts if doubt]
 
 
@@ -109,9 +109,6 @@ def writable(folder: Path) -> None:
 
 def check_truth(path: str, frame: str, grid: Any, placed: bool = True) -> None:
     """Look at a truth layer's header; raises what `truth` raises. `placed`: what the grid shows stands about there."""
-    import pyogrio
-    import pyproj
-
     from kibs_steps import truth
 
     name, facts = truth.layer_of(path, frame)
@@ -122,38 +119,60 @@ def check_truth(path: str, frame: str, grid: Any, placed: bool = True) -> None:
         raise truth.NoHeights(
             f"truth {path}, layer {name}, holds {kind}s without z: every outline must be a PolygonZ with a height at each corner"
         )
-    bounds = facts.get("total_bounds")
-    if bounds is None or not all(map(_finite, bounds)):
-        bounds = pyogrio.read_bounds(path, layer=name)[1]
-        bounds = (*bounds[:2].min(axis=1), *bounds[2:].max(axis=1))
-    move = pyproj.Transformer.from_crs(pyproj.CRS.from_user_input(facts["crs"]).to_2d(), grid.crs, always_xy=True)
-    left, bottom, right, top = move.transform_bounds(*bounds)
-    off = left > grid.bounds[2] + truth.AROUND or right < grid.bounds[0] - truth.AROUND or (
-        bottom > grid.bounds[3] + truth.AROUND or top < grid.bounds[1] - truth.AROUND
-    )  # fmt: skip
-    if placed and off:
+    bounds = _bounds(path, name, facts)
+    if placed and _off(bounds, facts["crs"], grid, truth.AROUND):
+        left, bottom, right, top = _moved(bounds, facts["crs"], grid)
         raise truth.NoOverlap(
             f"truth {path}, layer {name} ({facts['crs']}) lies at {left:.0f} {bottom:.0f} {right:.0f} {top:.0f} in {grid.crs}, "
             "outside the scene: check the layer's CRS and the raster it belongs to"
         )
 
 
+def _bounds(path: str, layer: str | None, facts: dict[str, Any]) -> tuple[float, ...]:
+    """Left, bottom, right, top of a layer in its own CRS: as its header says, else of its shapes."""
+    import pyogrio
+
+    bounds = facts.get("total_bounds")
+    if bounds is not None and all(map(_finite, bounds)):
+        return tuple(bounds)
+    boxes = pyogrio.read_bounds(path, layer=layer)[1]
+    return (*boxes[:2].min(axis=1), *boxes[2:].max(axis=1))
+
+
+def _moved(bounds: tuple[float, ...], crs: str, grid: Any) -> tuple[float, ...]:
+    """Bounds of a CRS in the grid's."""
+    import pyproj
+
+    move = pyproj.Transformer.from_crs(pyproj.CRS.from_user_input(crs).to_2d(), grid.crs, always_xy=True)
+    return move.transform_bounds(*bounds)
+
+
+def _off(bounds: tuple[float, ...], crs: str, grid: Any, around: float) -> bool:
+    """Whether all within these bounds lies more than `around` (m) outside the grid."""
+    left, bottom, right, top = _moved(bounds, crs, grid)
+    beside = left > grid.bounds[2] + around or right < grid.bounds[0] - around
+    return beside or bottom > grid.bounds[3] + around or top < grid.bounds[1] - around
+
+
 def _finite(value: float) -> bool:
     return value == value and abs(value) != float("inf")
 
 
-def check_sections(path: str) -> None:
+def check_sections(path: str, grid: Any) -> None:
     """Look at the header of a layer of edited sections; raises what `edited` raises."""
     import pyogrio
 
     from kibs_steps import edited
 
     try:
-        facts = pyogrio.read_info(path, layer=edited.layer_of(path))
+        layer = edited.layer_of(path)
+        facts = pyogrio.read_info(path, layer=layer)
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
         raise edited.SectionsUnusable(edited.UNREADABLE.format(path=path, error=error)) from error
     if facts["features"] == 0:
         raise edited.SectionsUnusable(edited.EMPTY_LAYER.format(path=path))
+    if facts["crs"] and _off(_bounds(path, layer, facts), facts["crs"], grid, 0.0):
+        raise edited.SectionsUnusable(edited.ELSEWHERE.format(path=path, crs=grid.crs.splitlines()[0]))
 
 
 def check_footprints(path: str) -> None:

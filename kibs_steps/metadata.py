@@ -54,7 +54,8 @@ def read(path: str | Path) -> Angles:
     path = Path(path)
     if not path.is_file():
         raise MetadataUnusable(f"metadata {path} is not there: give the vendor's .IMD, .XML, STAC .json or RPC file")
-    head = path.read_bytes()[:4096] if path.stat().st_size else b""
+    with path.open("rb") as source:
+        head = source.read(4096)
     text = path.read_text(encoding="utf-8-sig", errors="replace") if _is_text(head, path) else None
     if text is None:
         found = of_rpc(*_raster_rpc(path))
@@ -93,7 +94,7 @@ def of_imd(text: str, path: Path) -> Angles:
 
 def _maxar(values: dict[str, str], path: Path) -> Angles:
     def number(*keys: str) -> float | None:
-        return next((_number(values[key.lower()], key, path) for key in keys if key.lower() in values), None)
+        return next((_number(values[key.lower()], key, path) for key in keys if values.get(key.lower())), None)
 
     azimuth = number("meanSatAz", "satAz")
     sun = number("meanSunAz", "sunAz"), number("meanSunEl", "sunEl")
@@ -129,8 +130,10 @@ def of_xml(root: ElementTree.Element, path: Path) -> Angles:
     across, along = number("INCIDENCE_ANGLE_ACROSS_TRACK"), number("INCIDENCE_ANGLE_ALONG_TRACK")
     if azimuth is not None and across is not None and along is not None:
         azimuth -= np.degrees(np.arctan2(np.tan(np.radians(across)), np.tan(np.radians(along))))
+    else:  # that of the image's lines is not the satellite's
+        azimuth = number("SATELLITE_AZIMUTH_ANGLE")
     if incidence is None:
-        incidence, azimuth = number("SATELLITE_INCIDENCE_ANGLE"), number("SATELLITE_AZIMUTH_ANGLE")
+        incidence = number("SATELLITE_INCIDENCE_ANGLE")
     return Angles(
         None if azimuth is None else azimuth % 360.0,
         None if incidence is None else 90.0 - abs(incidence),
@@ -203,6 +206,8 @@ def of_rpc(rpc: Rpc, place: tuple[float, float, float]) -> Angles:
     east = (rpc.image(longitude + step, latitude, height) - here) / step
     north = (rpc.image(longitude, latitude + step, height) - here) / step
     up = (rpc.image(longitude, latitude, height + RISE) - here) / RISE
+    if not np.isfinite([east, north, up]).all() or np.linalg.matrix_rank(np.column_stack([east, north])) < 2:
+        raise MetadataUnusable(f"the RPC sends places near {latitude:.4f}, {longitude:.4f} nowhere: {_HELP}")
     d_longitude, d_latitude = np.linalg.solve(np.column_stack([east, north]), -up)
     azimuth, _, length = pyproj.Geod(ellps="WGS84").inv(
         longitude, latitude, longitude + d_longitude * RISE, latitude + d_latitude * RISE

@@ -66,6 +66,14 @@ def test_a_building_that_moved_past_its_sheds(tmp_path):
     ]
 
 
+def test_a_building_grouped_otherwise_has_not_moved(tmp_path):
+    """Four houses taken for one before: the middle of a quarter is another, though nothing moved."""
+    quarters = [(k + 1, x, y, 10, 6) for k, (x, y) in enumerate([(0, 0), (10, 0), (0, 10), (10, 10)])]
+    before, after = result(tmp_path / "old", [(1, 0, 0, 20, 6)]), result(tmp_path / "new", quarters)
+    changed = changes.changes(*(changes.read(folder)[0] for folder in (before, after)))
+    assert sorted(r["change"] for r in changed) == ["new", "new", "new", "same"]
+
+
 def test_the_other_way_round(tmp_path):
     old, new = result(tmp_path / "old", OLD), result(tmp_path / "new", NEW)
     rows = changes.changes(changes.read(new)[0], changes.read(old)[0])

@@ -8,7 +8,7 @@ import pytest
 import shapely
 import toy_city
 
-from kibs_steps import edited, store
+from kibs_steps import edited, inputs, store
 from kibs_steps.corners import CORNERS
 from kibs_steps.grid import Grid
 from kibs_steps.heightmap import EMPTY
@@ -46,7 +46,7 @@ def world(tmp_path):
     return facts, stitched, corners, layer
 
 
-def run(tmp_path, world, layer, crs=None):
+def run(tmp_path, world, layer, crs=None, left_out=()):
     facts, stitched, corners, _ = world
     (layer if crs is None else layer.to_crs(crs)).to_file(tmp_path / "edit.gpkg", layer="roof_sections_image")
     store.write_by_block(tmp_path / "stitched.parquet", {"r000c000": stitched, "r000c001": stitched.slice(0, 0)})
@@ -56,6 +56,7 @@ def run(tmp_path, world, layer, crs=None):
         ["--scene", str(facts.folder / "scene.json"), "--layer", str(tmp_path / "edit.gpkg"),
          "--stitched", str(tmp_path / "stitched.parquet"),
          "--found", str(tmp_path / "corners.parquet"), "--tile", "120", "--margin", "10", "--block", "1", "--reach", "7.5",
+         "--left-out", *left_out,
          "--sections", str(out[0]), "--corners", str(out[1])]
     )  # fmt: skip
     return pq.read_table(out[0]), pq.read_table(out[1])
@@ -81,7 +82,7 @@ def test_moved_split_deleted_and_drawn(tmp_path, world):
     to_map = facts.grid.to_map
     drawn = shapely.transform(shapely.box(200, 100, 220, 130), to_map)
     west, east = (shapely.transform(shapely.box(*b), to_map) for b in ((80, 40, 84, 60), (84, 40, 100, 60)))
-    stretched = shapely.transform(shapely.box(20, 40, 41, 60), to_map)
+    stretched = shapely.transform(shapely.box(20, 40, 46, 60), to_map)
     rows = [(ids[0], stretched), (ids[2], west), (ids[2], east), (ids[3], layer.geometry[3]), (None, drawn)]
     frame = geopandas.GeoDataFrame(
         {"section_id": [r[0] for r in rows]}, geometry=[r[1] for r in rows], crs=toy_city.CRS
@@ -105,6 +106,46 @@ def test_moved_split_deleted_and_drawn(tmp_path, world):
     assert {r["section_id"] for r in again.to_pylist()} == set(found)
 
 
+def test_a_nudged_outline_keeps_the_heights_seen_below_it(tmp_path, world):
+    """Else a roof whose corners were not found falls to a height that nobody measured, for one vertex moved by a pixel."""
+    layer = world[3].copy()
+    layer.geometry = [shapely.transform(shapely.box(21, 40, 40, 60), world[0].grid.to_map), *layer.geometry[1:]]
+    sections, _ = run(tmp_path, world, layer)
+    found = {r["section_id"]: r for r in sections.to_pylist()}[layer["section_id"][0]]
+    assert found["owner"] == 0  # touched
+    assert found["sums"] == [1.0] * len(EMPTY)
+
+
+def test_pixel_corners_stay_pixel_corners(tmp_path):
+    """By them `solids` tells traced outlines from drawn ones; most are off by the last bit on their way through map metres."""
+    grid = Grid("EPSG:32631", 597_123.4, 5_752_345.6, 0.38, 320, 240)
+    traced = shapely.Polygon([(10, 10), (31, 10), (31, 17), (44, 17), (44, 52.5), (10, 52)])
+    there = shapely.transform(traced, grid.to_map)
+    geopandas.GeoDataFrame(geometry=[there], crs=grid.crs).to_file(tmp_path / "a.gpkg")
+    _, (outline,) = edited.read(tmp_path / "a.gpkg", grid)
+    corners = {tuple(p) for p in shapely.get_coordinates(outline).tolist()}
+    assert {(10, 10), (31, 10), (31, 17), (44, 17), (10, 52)} <= corners
+    assert min(abs(row - 52.5) for _, row in corners) < 1e-6
+
+
+def test_sections_that_lie_elsewhere_are_refused_or_told(tmp_path, capsys):
+    """A layer with a wrong CRS would publish a whole city far away, one stray outline make every step visit what lies between."""
+    grid = Grid("EPSG:32631", 590_000.0, 5_750_000.0, 0.5, 320, 240)
+    here, far = (shapely.box(x, 5_749_950, x + 10, 5_749_960) for x in (590_050, 690_050))
+    for name, shapes in (("both.gpkg", [here, far]), ("far.gpkg", [far])):
+        geopandas.GeoDataFrame(geometry=shapes, crs=grid.crs).to_file(tmp_path / name)
+    assert len(edited.read(tmp_path / "both.gpkg", grid)[1]) == 1
+    assert "1 outlines lie outside the raster" in capsys.readouterr().err
+    for look in (edited.read, inputs.check_sections):
+        with pytest.raises(edited.SectionsUnusable, match="outside the raster"):
+            look(tmp_path / "far.gpkg", grid)
+
+
+def test_drawn_in_a_block_that_failed_is_told(tmp_path, world, capsys):
+    run(tmp_path, world, world[3], left_out=["r000c001"])
+    assert "1 in r000c001 are left out, as these blocks failed" in capsys.readouterr().err
+
+
 def test_a_layer_in_degrees_is_brought_back(tmp_path, world):
     sections, _ = run(tmp_path, world, world[3], "EPSG:4326")
     assert set(sections["section_id"].to_pylist()) == set(world[3]["section_id"])
@@ -123,6 +164,16 @@ def test_what_is_no_layer_of_polygons_is_refused(tmp_path, world):
     points.to_file(tmp_path / "points.gpkg")
     with pytest.raises(edited.SectionsUnusable, match="no polygons"):
         edited.read(tmp_path / "points.gpkg", grid)
+    (tmp_path / "table.csv").write_text("section_id,height\n1,2\n")
+    with pytest.raises(edited.SectionsUnusable, match="no polygons"):
+        edited.read(tmp_path / "table.csv", grid)
+    nowhere = geopandas.GeoDataFrame(geometry=[shapely.box(200, 95, 201, 96)], crs="EPSG:4326")
+    nowhere.to_file(tmp_path / "nowhere.gpkg")
+    with pytest.raises(edited.SectionsUnusable):
+        edited.read(tmp_path / "nowhere.gpkg", grid)
+    square = geopandas.GeoDataFrame(geometry=[shapely.transform(shapely.box(1, 1, 9, 9), grid.to_map)], crs=grid.crs)
+    square.to_file(tmp_path / "points.gpkg", layer="drawn")  # beside the points
+    assert len(edited.read(tmp_path / "points.gpkg", grid)[1]) == 1
 
 
 def test_a_bowtie_becomes_its_larger_part(world):

@@ -1,6 +1,7 @@
 """Metadata: files made like the vendors', and RPCs of a sensor whose direction is known in closed form."""
 
 import json
+import re
 
 import geopandas
 import numpy as np
@@ -99,6 +100,12 @@ def test_dimap_1_of_spot_5(tmp_path):
     assert metadata.read(written(tmp_path, "m.dim", text)) == Angles(104.2, 77.5, 150.0, 40.0)
 
 
+def test_an_empty_tag_says_nothing(tmp_path):
+    text = re.sub("<MEANSUNEL>.*?</MEANSUNEL>", "<MEANSUNEL></MEANSUNEL>", MAXAR_XML)
+    assert text != MAXAR_XML
+    assert metadata.read(written(tmp_path, "a.XML", text)) == Angles(181.1, 59.3, 155.4, None)
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -121,6 +128,11 @@ def test_stac_items_that_mislead_are_refused(tmp_path, change, match):
         ("a.json", "{}", "no STAC item"),
         ("a.xml", "<a><b></a>", "damaged"),
         ("a.xml", "<Dimap_Document/>", "where the satellite stood"),
+        (
+            "lines.xml",
+            re.sub("<INCIDENCE_ANGLE_A.*?>.*?>", "", dimap(12.0, 0.0, 30.7, 30.7)),
+            "where the satellite stood",
+        ),
         ("a.IMD", IMD.replace("59.3", "E"), "no number"),
         ("a_RPC.TXT", "LINE_OFF: 10\nLINE_NUM_COEFF_1: 1", "no whole RPC"),
     ],
@@ -200,6 +212,13 @@ def test_rpc_gives_the_direction_it_was_made_of(tmp_path, azimuth, elevation):
         found = metadata.read(file)
         assert found[:2] == pytest.approx((azimuth, elevation), abs=0.02)
         assert found[2:] == (None, None)
+
+
+def test_an_rpc_that_sends_all_places_to_one_is_refused(tmp_path):
+    rpc = linear_rpc(181.1, 59.3)
+    rpc.line_num_coeff = [0.0] * 20
+    with pytest.raises(MetadataUnusable, match="nowhere"):
+        metadata.read(written(tmp_path, "a.RPB", rpb(rpc)))
 
 
 def test_a_raster_without_rpc(tmp_path):

@@ -29,10 +29,13 @@ rule edited:
         signature=signature("edited"),
         tiling=lambda w: plan(w).tiling,
         reach=lambda w: plan(w).reach,
+        left_out=lambda w: (
+            ["--left-out", *plan(w).left_out] if plan(w).left_out else []
+        ),
     shell:
         "python -m kibs_steps.edited --scene {input.scene:q} --layer {input.layer:q} --stitched {input.stitched:q}"
         " --found {input.found:q} --tile {params.tiling.tile} --margin {params.tiling.margin}"
-        " --block {params.tiling.block} --reach {params.reach} --sections {output.sections:q}"
+        " --block {params.tiling.block} --reach {params.reach} {params.left_out:q} --sections {output.sections:q}"
         " --corners {output.corners:q} > {log:q} 2>&1"
 
 
