@@ -97,7 +97,7 @@ def doubts(plan: Plan, results: Path, needed: float) -> list[str]:
         if facts["stretch"]:
             ranges = ", ".join(f"{low:g}-{high:g}" for low, high, _ in facts["stretch"])
             found.append(f"{facts['dtype']} values are brought to 8 bit from {ranges} (1st to 99th percentile)")
-        if settings.get("view_azimuth") is None:
+        if settings.get("view_azimuth") is None and not any(said.startswith("view angles unknown") for said in found):
             there = " outside the regions" if settings.get("regions") else ""
             found.append(f"view angles unknown{there}: roofs are not moved to where they stand")
         if not plan.terrain_files and not sources.is_remote(plan.dtm):

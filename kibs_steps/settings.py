@@ -15,6 +15,7 @@ import yaml
 from kibs_steps.errors import KibsError
 
 PAGE = "docs/running.md lists all keys"
+TRAIN_PAGE = "docs/models.md lists them"
 
 
 class BadConfig(KibsError):
@@ -78,6 +79,8 @@ def check(config: dict[str, Any], schema: dict[str, Any]) -> None:
                 else schema["$defs"]["scene"]["properties"]["simulate"]
             )
             _known(part, of["properties"], f"{place}.")
+            if place == "train":
+                _train_known(part, of["properties"], scene)
     found = jsonschema.Draft202012Validator(schema).iter_errors(config)
     error = jsonschema.exceptions.best_match(e for e in found if e.validator != "unevaluatedProperties")
     if error is None:
@@ -99,10 +102,22 @@ def _simulated(config: dict[str, Any]) -> Iterable[tuple[str, Any]]:
             yield f"scenes.{name}.simulate", values.get("simulate")
 
 
-def _known(values: dict[str, Any], known: Iterable[str], place: str) -> None:
+def _train_known(train: dict[str, Any], properties: dict[str, Any], scene: set[str]) -> None:
+    """Refuse unknown keys one level below `train`; `scene` are the keys of a scene, which own data may have too."""
+    for name in ("shares", "thresholds"):
+        if isinstance(train.get(name), dict):
+            _known(train[name], properties[name]["properties"], f"train.{name}.", TRAIN_PAGE)
+    own = train.get("own")
+    for i, item in enumerate(own if isinstance(own, list) else ()):
+        if isinstance(item, dict):
+            (of,) = (kind for kind in properties["own"]["items"]["oneOf"] if kind["type"] == "object")
+            _known(item, scene | set(of["properties"]), f"train.own.{i}.", TRAIN_PAGE)
+
+
+def _known(values: dict[str, Any], known: Iterable[str], place: str, page: str = PAGE) -> None:
     for key in values:
         if key not in known:
-            raise BadConfig(f"{place}{key} is no setting{_meant(str(key), known)} ({PAGE})")
+            raise BadConfig(f"{place}{key} is no setting{_meant(str(key), known)} ({page})")
 
 
 def _meant(word: str, known: Iterable[str]) -> str:

@@ -84,18 +84,18 @@ class Truth(NamedTuple):
         return self.take((r[:, 0] < right) & (r[:, 2] > window.col) & (r[:, 1] < bottom) & (r[:, 3] > window.row))
 
 
-def read_layer(path: str | Path, frame: str) -> Layer:
+def read_layer(path: str | Path, frame: str, called: str = "truth") -> Layer:
     """The polygons of a vector file's layer (`layer_of`). Multipolygons are exploded, holes kept, outlines that cross
-    themselves repaired, with a warning.
+    themselves repaired, with a warning. `called`: the setting that names the file, for messages.
     """
     import pyogrio
 
-    name, meta = layer_of(path, frame)
+    name, meta = layer_of(path, frame, called)
     meta, _, wkb, fields = pyogrio.raw.read(path, layer=name)
 
-    parts, source = _sound(shapely.from_wkb(wkb), f"truth {path}, layer {name}")
+    parts, source = _sound(shapely.from_wkb(wkb), f"{called} {path}, layer {name}")
     if not len(parts):
-        raise NoPolygons(f"truth {path}, layer {name}, has no polygons")
+        raise NoPolygons(f"{called} {path}, layer {name}, has no polygons")
     named = dict(zip(meta["fields"], fields, strict=True))
     wanted = ("section_id", "truth_id", "building_id", "building", "split", "visible")
     columns = {key: named[key][source] for key in wanted if key in named}
@@ -117,7 +117,7 @@ def _sound(shapes: NDArray[np.object_], called: str) -> tuple[NDArray[np.object_
     return deeper[keep], source[inner][keep]
 
 
-def layer_of(path: str | Path, frame: str) -> tuple[str, dict]:
+def layer_of(path: str | Path, frame: str, called: str = "truth") -> tuple[str, dict]:
     """The layer of a vector file that is read, and pyogrio's facts about it: `sections_image` or `sections_map` by frame if
     there is one (or the layers of this project's own `city.gpkg`), else the first layer of polygons.
     """
@@ -126,15 +126,15 @@ def layer_of(path: str | Path, frame: str) -> tuple[str, dict]:
     try:
         layers = dict(pyogrio.list_layers(path))
     except (pyogrio.errors.DataSourceError, FileNotFoundError) as error:
-        raise UnreadableTruth(f"truth {path} cannot be read as a vector file: {error}") from error
+        raise UnreadableTruth(f"{called} {path} cannot be read as a vector file: {error}") from error
     known = [name for name in LAYERS[frame] if name in layers]
     drawn = [name for name, kind in layers.items() if kind and ("Polygon" in kind or kind == "Unknown")]
     if not (known or drawn):
-        raise NoPolygons(f"truth {path} has no layer of polygons (its layers: {', '.join(layers) or 'none'})")
+        raise NoPolygons(f"{called} {path} has no layer of polygons (its layers: {', '.join(layers) or 'none'})")
     name = (known or drawn)[0]
     facts = pyogrio.read_info(path, layer=name)
     if not facts["crs"]:
-        raise UnreadableTruth(f"truth {path}, layer {name}, states no CRS: set it, for instance with ogr2ogr -a_srs")
+        raise UnreadableTruth(f"{called} {path}, layer {name}, states no CRS: set it, for instance with ogr2ogr -a_srs")
     return name, facts
 
 

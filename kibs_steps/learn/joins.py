@@ -168,7 +168,7 @@ def main(argv: list[str] | None = None) -> None:
     )
     parser.add_argument("--data", help="data folder with roof photographs, which some of them show")
     parser.add_argument("--roofgraph", help="tar or extracted folder, if not DATA/roofgraph/roofgraph.tar")
-    parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
+    sources.add_left_out(parser)
     parser.add_argument("--cities", nargs="*", default=[], help="CityJSON files that some of them show parts of")
     sources.add_look(parser)
     args = parser.parse_args(argv)

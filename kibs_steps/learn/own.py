@@ -159,17 +159,18 @@ def _bounds(window: Window) -> tuple[int, int, int, int]:
     return window.col, window.row, window.col + window.width, window.row + window.height
 
 
-def outlines_on(scene: Scene, path: str | Path) -> NDArray[np.object_]:
-    """Polygons of a vector file in image coordinates (px), as they are drawn: nothing is moved by the view.
+def outlines_on(scene: Scene, path: str | Path, called: str) -> NDArray[np.object_]:
+    """Polygons of a vector file, `called` as the setting that names it, in image coordinates (px), as they are drawn: nothing is
+    moved by the view.
 
     Raises `NoOverlap` where none lies in the raster.
     """
-    layer = truth.read_layer(path, "image")
+    layer = truth.read_layer(path, "image", called)
     flat = layer._replace(polygons=shapely.force_3d(shapely.force_2d(layer.polygons), 0.0))
     on_grid = truth.to_grid(flat, scene.grid)
     found = shapely.transform(shapely.force_2d(on_grid), scene.grid.to_image)
     if not shapely.intersects(found, shapely.box(0, 0, scene.grid.width, scene.grid.height)).any():
-        raise truth.NoOverlap(f"{path}: no polygon lies in {scene.raster}: check the layer's CRS and place")
+        raise truth.NoOverlap(f"{called} {path}: no polygon lies in {scene.raster}: check the layer's CRS and place")
     return found
 
 
@@ -314,7 +315,7 @@ def main(argv: list[str] | None = None) -> None:
         projection_height=args.projection_height,
     )
     found = places(scene.grid.width, scene.grid.height, args.tile)
-    annotated = outlines_on(scene, args.annotated) if args.annotated else None
+    annotated = outlines_on(scene, args.annotated, "annotated") if args.annotated else None
     if annotated is not None:  # the shares are those of what is known
         found = [place for place in found if drawn(annotated, place.window).any()]
         if not found:
@@ -340,7 +341,7 @@ def main(argv: list[str] | None = None) -> None:
         store.write_table(args.out / "scene/truth.parquet", truth.table(layer, scene, args.truth_frame, args.truth_z))
         sections = truth.read(args.out / "scene/truth.parquet", scene)
     elif args.buildings:
-        buildings = outlines_on(scene, args.buildings)
+        buildings = outlines_on(scene, args.buildings, "buildings")
     for name in SPLITS:  # tiles of an earlier cut would be of another set now
         shutil.rmtree(args.out / name, ignore_errors=True)
     heights = []

@@ -49,6 +49,7 @@ ANNOTATIONS = ("truth", "buildings", "guess")
 SHARED = {"both": ("both", "sections", "corners")}
 SEPARATE = {"sections": ("sections",), "corners": ("corners",)}
 ALONE = {"sections": ("sections",)}
+FAMILY_OF = {"dense": "dense", "instances": "maskrcnn"}  # of the head that a contract names
 
 
 class Recipe(NamedTuple):
@@ -132,6 +133,9 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
         raise BadConfig(f"train: the set {train['name']} cannot be made from itself: give what is trained another name")
     if not own and not train["data"] and not train["tiles"]:
         raise BadConfig("train: nothing to learn from: give own, data or tiles")
+    for city in train["cities"]:
+        if not Path(city).is_file():
+            raise BadConfig(f"train.cities: {city} is not there: name a CityJSON file")
 
     options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
     options += [f"--family={train['family']}"]
@@ -168,7 +172,6 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
         starts[network] = [str(weights(train["init"], network, base))] if train["init"] else []
         training[network] = [*options, f"--task={network}"]
     network_of = {task: network for network, tasks in exports.items() for task in tasks}
-    cities = _files(train["cities"])
     models = {task: like_model(train["init"], task, base) if train["init"] else None for task in network_of}
     like = {task: [str(path)] if path else [] for task, path in models.items()}
     thresholds = [f"--thresholds={json.dumps(train['thresholds'])}"] if train["thresholds"] else []
@@ -187,19 +190,53 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
     seen = dense and train["lifts"] and "view" not in untold  # from an unknown view nobody knows where walls are shown
     lifts = {task: lifting if task == "corners" and seen else [] for task in network_of}
     return Recipe(
-        str(train["name"]), network_of, taken, own, look, training, export, joins, lifts, starts, like, cities
+        str(train["name"]),
+        network_of,
+        taken,
+        own,
+        look,
+        training,
+        export,
+        joins,
+        lifts,
+        starts,
+        like,
+        list(map(str, train["cities"])),
     )
 
 
 def of_run(config: dict[str, Any], base: Path, told: Collection[str], words: Collection[str]) -> Recipe:
     """The recipe in a run that is asked for by the `words` of a command line: what is wrong in it stops those alone that want
     what it makes. Raises `BadConfig` in these."""
+    asked = any(word == "train" or word.startswith(("runs/", "models/")) for word in words)
     try:
-        return recipe(config, base, told)
+        found = recipe(config, base, told)
+        if asked:
+            _to_be_made(found, str((config.get("train") or {}).get("family", DEFAULTS["family"])), base)
     except KibsError:
-        if any(word == "train" or word.startswith(("runs/", "models/")) for word in words):
+        if asked:
             raise
         return recipe({}, base)
+    return found
+
+
+def _to_be_made(found: Recipe, family: str, base: Path) -> None:
+    """Raise `BadConfig` where a set of that name is there that no run here has made and that would be written over, or where a
+    model that the training starts from, or keeps, is of another family."""
+    for folder in {(base / "models" / found.name).resolve(), (Path("models") / found.name).resolve()}:
+        if any(folder.glob("*.onnx")) and not (Path("runs") / found.name).is_dir():
+            raise BadConfig(
+                f"train.name: {folder} holds a model set that was not trained here: give what is trained another name"
+            )
+    from kibs_steps.models import contract
+
+    for path in sorted({*(file for files in found.like.values() for file in files), *found.taken.values()}):
+        own = FAMILY_OF[contract.load(path).contract["head"]]
+        if own != family:
+            raise BadConfig(
+                f"train: {path} is of family {own}, what is trained of {family}: name a set of that family in `init`, or "
+                "train both networks without (networks: separate)"
+            )
 
 
 def own_options(given: dict[str, Any], split: str, seed: int, gsd: float | None = None) -> list[str]:

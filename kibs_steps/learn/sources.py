@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--free", action="store_true", help="of DATA take what is under a free licence alone: chips of SpaceNet-2"
     )
-    parser.add_argument("--leave-out", nargs="*", default=[], help="places of the chips to keep for testing")
+    add_left_out(parser)
     parser.add_argument("--own", nargs="*", default=[], help="folders of own samples (learn.own)")
     parser.add_argument("--gsd", type=float, default=dataset.GSD, help="of the model to train, m per px")
     parser.add_argument(
@@ -74,6 +74,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name in ("view", "sun"):
         parser.add_argument(f"--{name}-azimuth", type=float, help="simulate for one scene: its angle, deg")
         parser.add_argument(f"--{name}-elevation", type=float)
+
+
+def add_left_out(parser: argparse.ArgumentParser) -> None:
+    """The option that keeps places of the chips for testing."""
+    parser.add_argument(
+        "--leave-out", nargs="*", default=[], choices=photographs.CHIPS, help="places of the chips to keep for testing"
+    )
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:
@@ -158,6 +165,17 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     )
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
+    there = {
+        "simulated": bool(args.tiles) or any(pool.glob("[!.]*.npz")),
+        "pasted": bool(training and chips),
+        "chips": bool(chips),
+        "own": bool(own),
+    }
+    if not any(there[name] and wanted[name] for name in NAMES):
+        shared = ", ".join(f"{name} {wanted[name]:g}" for name in NAMES)
+        raise photographs.NoTrainingData(
+            f"nothing to learn from: there is {' and '.join(filter(there.get, NAMES)) or 'nothing'}, the shares are {shared}"
+        )
     kept = [path for folder in args.own for path in sorted(Path(folder, "validation").glob("[!.]*.npz"))]
     validation = [Sample.load(path) for path in kept]
     validation += [

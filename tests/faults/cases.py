@@ -352,6 +352,14 @@ def _(folder):
     return {"regions": str(vector(folder / "t.gpkg", [shapely.box(*BOX)]))}
 
 
+@case("other layers", "corrected sections that lie elsewhere", "SectionsUnusable",
+      "sections t.gpkg lie outside the raster, which is in …: check the layer's CRS, and that it belongs to the "
+      "raster")  # fmt: skip
+def _(folder):
+    far = shapely.box(*(v + 90_000 for v in BOX))
+    return {"sections": str(vector(folder / "t.gpkg", [far]))}
+
+
 @case("other layers", "regions whose angles are no numbers", "RegionsUnusable",
       "regions t.geojson: an angle is no number (…): give degrees, as in 181.1")  # fmt: skip
 def _(folder):
@@ -372,6 +380,18 @@ def _(folder):
 @case("settings", "a key nobody knows", "BadConfig", "colour is no setting (docs/running.md lists all keys)")
 def _(folder):
     return {"colour": "red"}
+
+
+@case("settings", "a key mistyped one level down", "BadConfig",
+      "train.shares.simulted is no setting: did you mean simulated? (docs/models.md lists them)")  # fmt: skip
+def _(folder):
+    return {"train": {"shares": {"simulted": 1}}}
+
+
+@case("settings", "a key of own data mistyped", "BadConfig",
+      "train.own.0.anotated is no setting: did you mean annotated? (docs/models.md lists them)")  # fmt: skip
+def _(folder):
+    return {"train": {"own": [{"raster": "a.tif", "dtm": 1, "truth": "t.gpkg", "anotated": "a.gpkg"}]}}
 
 
 @case("settings", "a word mistyped", "BadConfig",

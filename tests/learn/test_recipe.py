@@ -6,6 +6,7 @@ import pytest
 import toy
 
 from kibs_steps.learn import recipe
+from kibs_steps.models import contract
 from kibs_steps.plan import BadConfig
 
 SCENES = {
@@ -62,9 +63,10 @@ def test_joins_are_learned_for_networks_that_find_basins(tmp_path):
     assert recipe.recipe({}, tmp_path).joins == {"both": ["--scenes=120"], "sections": ["--scenes=120"], "corners": []}
     for train in ({"family": "maskrcnn", "joins": 9}, {"joins": 0}):
         assert not any(recipe.recipe({"train": train}, tmp_path).joins.values())
-    given = {"data": "kibs", "cities": ["a.json"], "joins": 5}
+    (tmp_path / "a.json").touch()
+    given = {"data": "kibs", "cities": [str(tmp_path / "a.json")], "joins": 5}
     shown = recipe.recipe({"train": given}, tmp_path).joins["both"]
-    assert shown == ["--scenes=5", "--data=kibs", "--cities", "a.json"]
+    assert shown == ["--scenes=5", "--data=kibs", "--cities", str(tmp_path / "a.json")]
     kept = recipe.recipe({"train": {**given, "leave_out": ["inria"]}}, tmp_path).joins["both"]
     assert kept == [*shown, "--leave-out", "inria"]
     assert "--data=kibs" not in recipe.recipe({"train": {**given, "free": True}}, tmp_path).joins["both"]
@@ -218,6 +220,7 @@ def test_angles_may_come_from_metadata(tmp_path):
         ({"scene": "parts"}, "name a scene of one view"),
         ({"init": "nothing"}, r"nothing is no file"),
         ({"tiles": 0}, "nothing to learn from"),
+        ({"cities": ["none.json"]}, "none.json is not there"),
         ({"name": "a", "init": "a"}, "set a cannot be made from itself"),
         ({"name": "a", "init": "models/a"}, "set a cannot be made from itself"),
     ],
@@ -225,6 +228,34 @@ def test_angles_may_come_from_metadata(tmp_path):
 def test_what_cannot_be_trained_is_said(tmp_path, train, message):
     with pytest.raises(BadConfig, match=message):
         recipe.recipe({"scenes": SCENES, "train": train}, tmp_path)
+
+
+def test_a_set_that_was_not_trained_here_is_not_written_over(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "models/free").mkdir(parents=True)
+    toy.corners_model(tmp_path / "models/free/corners.onnx")
+    config = {"train": {"name": "free"}}
+    with pytest.raises(BadConfig, match="free holds a model set that was not trained here"):
+        recipe.of_run(config, tmp_path, (), ["train"])
+    assert recipe.of_run(config, tmp_path, (), ["results/a/city.gpkg"]).name == "free"  # who trains nothing may have it
+    (tmp_path / "here/runs/free").mkdir(parents=True)
+    assert recipe.of_run(config, tmp_path, (), ["train"]).name == "free"
+
+
+def test_models_of_another_family_are_no_start(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "models/pair"
+    folder.mkdir(parents=True)
+    toy.models(folder)
+    head = contract.load(folder / "corners.onnx").contract["head"]
+    same, other = ("dense", "maskrcnn") if head == "dense" else ("maskrcnn", "dense")
+    for task in ("sections", "corners"):
+        (folder / f"{task}.pt").touch()
+    train = {"name": "mine", "init": "pair", "networks": "separate"}
+    assert recipe.of_run({"train": {**train, "family": same}}, tmp_path, (), ["train"]).like
+    with pytest.raises(BadConfig, match=f"is of family {same}, what is trained of {other}"):
+        recipe.of_run({"train": {**train, "family": other}}, tmp_path, (), ["train"])
 
 
 def test_an_items_own_metadata_stands_above_its_scenes_angles(tmp_path):

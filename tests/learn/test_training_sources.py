@@ -175,9 +175,8 @@ def test_photographs_make_a_model_non_commercial():
 def test_nothing_to_learn_from_is_said(tmp_path):
     with pytest.raises(photographs.NoTrainingData, match="no training samples"):
         sources.gather(arguments("--own", str(tmp_path), "--tiles=0"), 48)
-    empty = sources.gather(arguments("--tiles=0", f"--out={tmp_path}/run/both"), 48)
     with pytest.raises(photographs.NoTrainingData, match="nothing to learn from"):
-        empty.mixture[0]
+        sources.gather(arguments("--tiles=0", f"--out={tmp_path}/run/both"), 48)
     with pytest.raises(argparse.ArgumentTypeError, match="no source"):
         sources.shares("simulatd=1")
 
@@ -199,7 +198,11 @@ def test_free_sources_are_those_anyone_may_use(tmp_path):
     assert not found.mixture.graphs
     assert found.about["licence"] == sources.SHARE_ALIKE
     assert found.about["data"] == ["chips with building masks of SpaceNet-2"]
-    none = sources.gather(arguments("--free", *options, "--leave-out", "spacenet"), 48)
-    assert none.about["licence"] == sources.SIMULATED
+    with pytest.raises(photographs.NoTrainingData, match=r"there is nothing, the shares are simulated 0.62"):
+        sources.gather(arguments("--free", *options, "--leave-out", "spacenet"), 48)
+    with pytest.raises(photographs.NoTrainingData, match=r"there is chips, the shares are .* chips 0,"):
+        sources.gather(arguments("--free", *options, "--shares=chips=0"), 48)
+    with pytest.raises(SystemExit):  # a place that is none would be learned from, and is to be tested
+        arguments("--leave-out", "inrja")
     with pytest.raises(photographs.NoTrainingData, match="roofgraph"):
         sources.gather(arguments(*options), 48)
