@@ -133,9 +133,9 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
         raise BadConfig(f"train: the set {train['name']} cannot be made from itself: give what is trained another name")
     if not own and not train["data"] and not train["tiles"]:
         raise BadConfig("train: nothing to learn from: give own, data or tiles")
-    for city in train["cities"]:
-        if not Path(city).is_file():
-            raise BadConfig(f"train.cities: {city} is not there: name a CityJSON file")
+    cities = list(map(str, train["cities"]))
+    if lost := [city for city in cities if not Path(city).is_file()]:
+        raise BadConfig(f"train.cities: {lost[0]} is not there: name a CityJSON file")
 
     options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
     options += [f"--family={train['family']}"]
@@ -190,18 +190,7 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
     seen = dense and train["lifts"] and "view" not in untold  # from an unknown view nobody knows where walls are shown
     lifts = {task: lifting if task == "corners" and seen else [] for task in network_of}
     return Recipe(
-        str(train["name"]),
-        network_of,
-        taken,
-        own,
-        look,
-        training,
-        export,
-        joins,
-        lifts,
-        starts,
-        like,
-        list(map(str, train["cities"])),
+        str(train["name"]), network_of, taken, own, look, training, export, joins, lifts, starts, like, cities
     )
 
 

@@ -166,7 +166,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     if args.tiles and not own and not chips:
         _wait_for_first(pool)
     there = {
-        "simulated": bool(args.tiles) or any(pool.glob("[!.]*.npz")),
+        "simulated": bool(args.tiles) or any(pool.glob("[!.]*.npz")),  # to be rendered, or rendered before
         "pasted": bool(training and chips),
         "chips": bool(chips),
         "own": bool(own),
@@ -185,8 +185,7 @@ def gather(args: argparse.Namespace, size: int, upright: bool = True, heights_ne
     validation = [
         prepared(as_seen(sample, i, shown, args.untold), size, upright) for i, sample in enumerate(validation)
     ]
-    simulates = bool(args.tiles) or any(pool.glob("[!.]*.npz"))
-    return Sources(mixture, validation, about(args, simulates, bool(graphs), bool(chips), view, sun))
+    return Sources(mixture, validation, about(args, there["simulated"], bool(graphs), bool(chips), view, sun))
 
 
 def signature(args: argparse.Namespace) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cases
 import good_inputs
 import numpy as np
+import page
 import pyproj
 import pytest
 import rasterio
@@ -58,7 +59,7 @@ def test_the_good_input_is_taken(tmp_path):
 
 
 def test_the_page_tells_all_cases():
-    assert cases.tables() in cases.PAGE.read_text()
+    assert page.tables() in page.PAGE.read_text()
 
 
 def test_a_truth_that_crosses_itself_is_repaired(tmp_path, capsys):

@@ -6,10 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from kibs_steps import photographs, store
 from kibs_steps.learn import dataset, sources
 from kibs_steps.learn.samples import Sample
+
+ROOT = Path(__file__).parents[2]
 
 
 def arguments(*words):
@@ -204,5 +207,8 @@ def test_free_sources_are_those_anyone_may_use(tmp_path):
         sources.gather(arguments("--free", *options, "--shares=chips=0"), 48)
     with pytest.raises(SystemExit):  # a place that is none would be learned from, and is to be tested
         arguments("--leave-out", "inrja")
+    schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
+    places = schema["properties"]["train"]["properties"]["leave_out"]["items"]["enum"]
+    assert places == list(photographs.CHIPS)
     with pytest.raises(photographs.NoTrainingData, match="roofgraph"):
         sources.gather(arguments(*options), 48)
