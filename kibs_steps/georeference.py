@@ -187,7 +187,7 @@ def convergence(grid: Grid) -> float:
 
 
 def check_vertical(vertical_crs: str | None) -> None:
-    """Raise `VerticalCrsUnusable` for a vertical CRS that is none, is more than that, or does not count in metres."""
+    """Raise `VerticalCrsUnusable` for a vertical CRS that is none, is more than that, or does not count metres upwards."""
     import pyproj
 
     from kibs_steps import imagery
@@ -211,6 +211,11 @@ def check_vertical(vertical_crs: str | None) -> None:
         raise VerticalCrsUnusable(
             f"vertical_crs={vertical_crs} counts in {found.axis_info[0].unit_name}, published heights are in metres: give "
             "the CRS of the same datum in metres (the terrain model may be in feet)"
+        )
+    if found.axis_info[0].direction != "up":
+        raise VerticalCrsUnusable(
+            f"vertical_crs={vertical_crs} counts depths ({found.name}), published heights are counted upwards: give the CRS of "
+            "heights of the same datum"
         )
 
 

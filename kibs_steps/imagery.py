@@ -122,6 +122,7 @@ def crs_of(source: rasterio.DatasetReader) -> pyproj.CRS:
         )
     crs = pyproj.CRS.from_wkt(source.crs.to_wkt())
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    crs = crs.to_2d() if len(crs.axis_info) > 2 else crs  # an image has no heights that a third axis could count
     if not (crs.is_projected or crs.is_geographic):
         raise NotGeoreferenced(f"{source.name} has a local CRS ({crs.name}): assign its real one (gdal_edit.py -a_srs)")
     return crs

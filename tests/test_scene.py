@@ -89,6 +89,13 @@ class TestModelGrid:
         )
         assert georeference.model_grid(path, 0.38).crs == "EPSG:28992"
 
+    def test_a_third_axis_of_the_crs_counts_nothing(self, tmp_path):
+        solid = pyproj.CRS("EPSG:32631").to_3d().to_wkt()
+        path = rasters.write(tmp_path / "a.tif", rasters.picture(), solid)
+        with rasterio.open(path) as source:
+            assert len(pyproj.CRS.from_wkt(source.crs.to_wkt()).axis_info) == 3
+        assert georeference.model_grid(path, 0.38).crs == "EPSG:32631"
+
     def test_too_coarse_is_refused(self, tmp_path):
         path = rasters.write(tmp_path / "a.tif", rasters.picture(), gsd=0.62)
         with pytest.raises(georeference.GsdTooCoarse, match=r"0\.62 m"):

@@ -25,6 +25,7 @@ from kibs_steps.scene import Scene
 
 LONGEST = 4096  # px: longer side of the image on the roofs, the largest that every graphics card takes
 # glTF's own default is a mirror.
+CLAMP_TO_EDGE = 33071  # of a glTF sampler
 MATT = {"name": "by kind", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
 BY_KIND, IMAGE = 0, 1  # materials
 
@@ -70,7 +71,12 @@ def write(
             image, _ = glb.view("image", photograph(drape))
             texture = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
             more["materials"].append({"name": "image", "pbrMetallicRoughness": texture})
-            more |= {"textures": [{"source": 0}], "images": [{"bufferView": image, "mimeType": "image/jpeg"}]}
+            more |= {
+                "textures": [{"source": 0, "sampler": 0}],
+                "images": [{"bufferView": image, "mimeType": "image/jpeg"}],
+            }
+            # Beyond the image's edge its rim goes on: repeated, as glTF has it else, a roof there would wear the other side.
+            more["samplers"] = [{"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}]
             dtm = drape.terrain(drape.grid.bounds)
         top = []
         for mesh in found:

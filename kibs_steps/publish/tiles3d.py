@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from kibs_steps import cli, georeference, store, verify
+from kibs_steps import cli, georeference, store, sums
 from kibs_steps import scene as scenes
 from kibs_steps.mesh import LINEAR, Mesh, by_kind, read
 from kibs_steps.publish import licences
@@ -173,8 +173,9 @@ def main(argv: list[str] | None = None) -> None:
     shutil.rmtree(making, ignore_errors=True)
     making.mkdir(parents=True)
     write(making, squares(args.meshes), earth, {"extras": {k: v for k, v in told.items() if v}})
-    for kept in folder.glob(f"*{verify.ASIDE}"):  # what a user changed and `verify` set aside
-        kept.rename(making / kept.name)
+    for path in folder.glob("[!.]*"):  # what a user put there, or changed and `verify` set aside: what is made has sums
+        if not sums.place(path).exists() and not (making / path.name).exists():
+            path.rename(making / path.name)
     shutil.rmtree(folder, ignore_errors=True)
     making.rename(folder)
 

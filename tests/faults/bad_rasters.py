@@ -193,6 +193,13 @@ def _(folder):
     return {"vertical_crs": "EPSG:6360"}
 
 
+@case("terrain", "`vertical_crs` of depths", "VerticalCrsUnusable",
+      "vertical_crs=EPSG:5715 counts depths (MSL depth), published heights are counted upwards: give the CRS of heights of the "
+      "same datum")  # fmt: skip
+def _(folder):
+    return {"vertical_crs": "EPSG:5715"}
+
+
 @case("terrain", "a surface model that is not there", "DtmMissing",
       "dsm: raster nowhere.tif does not exist: check the path")  # fmt: skip
 def _(folder):

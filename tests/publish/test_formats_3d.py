@@ -16,7 +16,7 @@ import shapely
 import toy_city
 import trimesh
 
-from kibs_steps import mesh, view
+from kibs_steps import mesh, store, view
 from kibs_steps import scene as scenes
 from kibs_steps.publish import dsm, glb, ksr, obj, tiles3d, viewer
 from kibs_steps.publish.gltf import Glb
@@ -123,6 +123,10 @@ def test_roofs_wear_the_image_where_they_are_seen(town, tmp_path):
     np.testing.assert_allclose(np.sort(roof.visual.uv[:, 0]), np.sort(uv[:, 0]), atol=1e-4)
     np.testing.assert_allclose(np.sort(1 - roof.visual.uv[:, 1]), np.sort(uv[:, 1]), atol=1e-4)
     assert roof.visual.material.baseColorTexture.size == (scene.grid.width, scene.grid.height)
+    content = out.read_bytes()
+    tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (texture,) = tree["textures"]  # beyond the image's edge its rim goes on, not its other side
+    assert tree["samplers"][texture["sampler"]] == {"wrapS": 33071, "wrapT": 33071}
 
 
 def test_a_roof_across_regions_wears_the_one_view_that_shows_it(tmp_path):
@@ -166,6 +170,20 @@ def test_obj_is_read_back_with_the_volume(town, tmp_path):
     body = trimesh.Trimesh(vertices, faces)
     total = sum(m.attributes["volume"] for m in mesh.meshes([folder / "meshes.parquet"]))
     assert body.volume == pytest.approx(total, rel=1e-3)
+
+
+def test_tiles_made_again_leave_what_a_user_put_beside_them(town, tmp_path):
+    _, arguments = town
+    folder = tmp_path / "tiles3d"
+    tiles3d.main([*arguments, "--out", str(folder / "tileset.json")])
+    made = {path.name: path.read_bytes() for path in folder.glob("[!.]*")}
+    (folder / "index.html").write_text("a page")
+    (folder / "0_0.glb.changed").write_text("set aside")
+    with store.whole(folder / "99_99.glb") as gone:  # of a city that was larger
+        gone.write_text("a tile")
+    tiles3d.main([*arguments, "--out", str(folder / "tileset.json")])
+    after = {path.name: path.read_bytes() for path in folder.glob("[!.]*")}
+    assert after == {**made, "index.html": b"a page", "0_0.glb.changed": b"set aside"}
 
 
 def test_tiles_stand_at_their_place_on_the_earth(town, tmp_path):
