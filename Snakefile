@@ -45,6 +45,7 @@ onstart:
 
 
 onsuccess:
+    remove_temporary(workflow.dag, workflow.storage_settings.notemp)
     for p in PLANS.values():
         if not p.left_out:
             failures.settle(RESULTS / p.name)

@@ -220,6 +220,19 @@ def test_deleted_result_is_made_again(copy):
     assert digests(copy) == before
 
 
+def test_temporary_files_of_a_killed_run_are_removed_unless_kept(copy):
+    """A kill after the last job that reads them, before Snakemake deletes them, leaves them as `--notemp` does."""
+    blended = copy / "results/town/blocks/r000c001/blended.tif"
+    shutil.rmtree(blended.parent)
+    run(copy, "--notemp")
+    (copy / "results/town/points.txt").unlink()
+    run(copy, "--notemp")
+    assert blended.exists()
+    (copy / "results/town/points.txt").unlink()
+    assert set(jobs(run(copy))) == {"points"}
+    assert not blended.exists()
+
+
 def test_cores_do_not_matter(town, tmp_path):
     """The town was made on two cores."""
     folder = world(tmp_path / "again")

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
-from snakemake.io import IOFile
+from snakemake.io import IOFile, is_flagged
 
 from kibs_steps import cli, failures, inputs as user_inputs, plan as plans, settings
 from kibs_steps import sources
@@ -125,6 +125,14 @@ def inputs(step, *outputs):
         return choose
 
     return given
+
+
+def remove_temporary(dag, keep):
+    """Delete the temporary files that stay where a run was killed after the last job that reads them; none with `keep`."""
+    for job in [] if keep else dag.jobs:
+        for path in job.output:
+            if is_flagged(path, "temp") and job not in dag.targetjobs:
+                Path(path).unlink(missing_ok=True)
 
 
 def everything(wildcards):
