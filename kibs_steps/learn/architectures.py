@@ -16,6 +16,7 @@ explicit.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -249,16 +250,18 @@ class Dense(nn.Module):
 
     The image itself joins at stride 2 with its 2×2 pixels as channels, and the maps leave by a pixel shuffle. With a `zoom` the
     network sees the image enlarged so many times and gives maps of the image as it is: half of all sections are only a few
-    cells of stride 2 wide. Sides times zoom are multiples of 32.
+    cells of stride 2 wide. Sides times zoom are multiples of 32. With a `blur` (px) it sees the image through a Gaussian of that
+    deviation: what is finer in imagery of unknown origin, as the hatching that pansharpening leaves, tells nothing of roofs.
     """
 
     widths = (32, 40, 48, 64, 96)  # decoder channels at strides 2, 4, 8, 16, 32
     depths = (1, 2, 1, 1)  # residuals at strides 2, 4, 8, 16
 
-    def __init__(self, bins: int, task: str = "both", zoom: float = 1.0):
+    def __init__(self, bins: int, task: str = "both", zoom: float = 1.0, blur: float = 0.0):
         super().__init__()
         self.task = task
         self.zoom = zoom
+        self.blur = blur
         self.bins = bins
         self.encoder = Encoder()
         self.geometry = nn.Sequential(nn.Linear(GEOMETRY, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU())
@@ -287,6 +290,8 @@ class Dense(nn.Module):
         `roof_slope` (m of height per px of column and row, as sections and as heights tell it), `centre` (way to the middle of
         the section, in CENTRE_UNIT px) and `height` (bins).
         """
+        if self.blur:
+            image = blurred(image, self.blur)
         if self.zoom != 1:
             image = resized(image, self.zoom)
             geometry = torch.cat([geometry[:, :4] * self.zoom, geometry[:, 4:]], dim=1)
@@ -336,6 +341,16 @@ class Dense(nn.Module):
             "centre": lambda x: CENTRE_UNIT * resized(x, 4),
         }
         return tuple(final.get(name, torch.sigmoid)(raw[name]) for name in OUTPUTS[self.task])
+
+
+def blurred(image: torch.Tensor, sigma: float) -> torch.Tensor:
+    """Images (n, c, h, w) through a Gaussian of deviation `sigma` (px), cut at 3 sigma; beyond their rims they are mirrored."""
+    reach, channels = math.ceil(3 * sigma), image.shape[1]
+    weight = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=image.device) / sigma) ** 2).to(image.dtype)
+    weight = (weight / weight.sum()).repeat(channels, 1)
+    image = F.pad(image, (reach,) * 4, mode="reflect")
+    image = F.conv2d(image, weight[:, None, None, :], groups=channels)
+    return F.conv2d(image, weight[:, None, :, None], groups=channels)
 
 
 def softmax(maps: torch.Tensor) -> torch.Tensor:

@@ -239,7 +239,7 @@ def main(argv: list[str] | None = None) -> None:
     gsd = args.gsd or settings.gsd
     if gsd != settings.gsd and (task, settings.family) != ("sections", "dense"):
         parser.error(f"--gsd {gsd:g}: only a dense network for sections alone can be made into a model for another GSD")
-    model = training.network(task, settings.family, zoom_at(gsd, settings))
+    model = training.network(task, settings.family, zoom_at(gsd, settings), settings.blur * settings.gsd / gsd)
     model.load_state_dict(average)
     about = {**state.get("about", {}), "tiles_seen": state["step"] * settings.batch}
     about |= {"minutes": round(state["seconds"] / 60, 1), "converged": state.get("converged")}

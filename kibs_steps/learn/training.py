@@ -50,6 +50,7 @@ class Settings(NamedTuple):
     task: str = "both"
     zoom: float = 1.0
     gsd: float = dataset.GSD
+    blur: float = 0.0
 
 
 class Best(NamedTuple):
@@ -90,9 +91,9 @@ def instance_terms(model: nn.Module, batch: dict[str, Any]) -> Batch:
         return {name: value.float() for name, value in maskrcnn.loss_terms(model, batch).items()}
 
 
-def network(task: str = "both", family: str = "dense", zoom: float = 1.0) -> nn.Module:
-    """A new network that gives the outputs of a task; a dense one sees the image enlarged `zoom` times."""
-    return maskrcnn.network(task) if family == "maskrcnn" else Dense(len(CENTRES), task, zoom)
+def network(task: str = "both", family: str = "dense", zoom: float = 1.0, blur: float = 0.0) -> nn.Module:
+    """A new network that gives the outputs of a task; a dense one sees the image `blur` px blurred and enlarged `zoom` times."""
+    return maskrcnn.network(task) if family == "maskrcnn" else Dense(len(CENTRES), task, zoom, blur)
 
 
 def usual_zoom(task: str, gsd: float, init: str | Path | None = None) -> float:
@@ -100,9 +101,20 @@ def usual_zoom(task: str, gsd: float, init: str | Path | None = None) -> float:
     else at about SECTIONS_SEEN m per px."""
     if task != "sections":
         return 1.0
-    before = torch.load(init, weights_only=True, map_location="cpu").get("settings") if init else None
+    before = settings_of(init)
     seen = before["gsd"] / before["zoom"] if before and before["task"] == task else SECTIONS_SEEN
     return max(1.0, round(2 * gsd / seen) / 2)
+
+
+def usual_blur(gsd: float, init: str | Path | None = None) -> float:
+    """The blur (px) unless another is asked for: as many metres as for the weights that a run starts from."""
+    before = settings_of(init) or {}
+    return before.get("blur", 0.0) * before.get("gsd", gsd) / gsd
+
+
+def settings_of(init: str | Path | None) -> dict[str, Any] | None:
+    """What weights tell of the run that made them (`Settings`); None where they tell nothing."""
+    return torch.load(init, weights_only=True, map_location="cpu").get("settings") if init else None
 
 
 def moved(batch: Any, device: torch.device) -> Any:
@@ -289,6 +301,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--batch", type=int, help="tiles per step")
     parser.add_argument("--size", type=int, help="side of a dense network's training tiles, px")
     parser.add_argument("--zoom", type=float, help="how many times larger a dense network sees the image")
+    parser.add_argument(
+        "--blur",
+        type=float,
+        help="deviation of a Gaussian (px) through which a dense network sees the image, now and ever after (default: as the "
+        "weights it starts from, else 0)",
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2, help="of torch, on a CPU")
     parser.add_argument("--workers", type=int, default=1, help="processes that prepare tiles")
@@ -309,15 +327,18 @@ def main(argv: list[str] | None = None) -> None:
     else:
         task = args.task or "both"
         rate, zoom = args.rate or 2e-3, args.zoom or usual_zoom(task, args.gsd, args.init)
+        blur = usual_blur(args.gsd, args.init) if args.blur is None else args.blur
+        if not 0 <= blur <= 5:
+            parser.error(f"--blur {blur:g}: give px between 0 (none) and 5")
         if zoom <= 0 or zoom % 0.5:
             parser.error(f"--zoom {zoom:g}: it goes by halves (1, 1.5, 2), so that tiles have whole cells of stride 32")
         if zoom != 1 and task != "sections":
             parser.error("--zoom is for a network for sections alone (--task sections): offsets and slopes are in px")
         if (size := args.size or SIZE) * zoom % 32:
             parser.error(f"--size {size}: times the zoom, {zoom:g}, it must be a multiple of 32")
-        settings = Settings(args.seed, size, args.batch or 8, rate, task=task, zoom=zoom, gsd=args.gsd)
+        settings = Settings(args.seed, size, args.batch or 8, rate, task=task, zoom=zoom, gsd=args.gsd, blur=blur)
     torch.manual_seed(settings.seed)
-    model = network(settings.task, settings.family, settings.zoom)
+    model = network(settings.task, settings.family, settings.zoom, settings.blur)
     if args.init:
         start_from(model, args.init)
     elif args.family == "dense":

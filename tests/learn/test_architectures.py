@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 torch = pytest.importorskip("torch", reason="networks need the extra `learn` (torch)")
 
 from kibs_steps.learn import training  # noqa: E402
-from kibs_steps.learn.architectures import OUTPUTS, SWEPT, Sweep, softmax  # noqa: E402
+from kibs_steps.learn.architectures import OUTPUTS, SWEPT, Sweep, blurred, softmax  # noqa: E402
 
 
 @pytest.mark.parametrize(("stride", "block"), [(4, 1), (2, 2)])
@@ -49,6 +50,20 @@ def test_a_zoomed_network_is_the_same_network_on_a_larger_image():
     ):
         smaller = unit * torch.nn.functional.interpolate(expected[name], size=(side, side), mode="bilinear")
         assert torch.allclose(raw[name], smaller, atol=1e-5)
+
+
+def test_a_network_with_a_blur_is_the_same_network_on_a_blurred_image():
+    torch.manual_seed(0)
+    plain = training.network("sections").eval()
+    seeing = training.network("sections", blur=1.3).eval()
+    seeing.load_state_dict(plain.state_dict())
+    image, geometry = torch.rand(2, 3, 64, 64), torch.zeros(2, 6)
+    through = ndimage.gaussian_filter(image.numpy(), 1.3, mode="mirror", radius=4, axes=(2, 3))
+    assert np.abs(blurred(image, 1.3).numpy() - through).max() < 1e-6
+    with torch.no_grad():
+        expected = plain.logits(torch.from_numpy(through), geometry)
+        raw = seeing.logits(image, geometry)
+    assert all(torch.allclose(raw[name], expected[name], atol=1e-5) for name in expected)
 
 
 @pytest.mark.parametrize("task", ["sections", "corners"])

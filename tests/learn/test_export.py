@@ -13,10 +13,13 @@ from kibs_steps.models import contract as contracts  # noqa: E402
 from kibs_steps.models import heads, joining, runtime, scoring  # noqa: E402
 
 
-@pytest.mark.parametrize(("task", "zoom"), [("sections", 1.0), ("sections", 1.5), ("corners", 1.0), ("both", 1.0)])
-def test_onnx_equals_torch(task, zoom, tmp_path):
+@pytest.mark.parametrize(
+    ("task", "zoom", "blur"),
+    [("sections", 1.0, 0), ("sections", 1.5, 0), ("sections", 1.5, 1.0), ("corners", 1.0, 0), ("both", 1.0, 0)],
+)
+def test_onnx_equals_torch(task, zoom, blur, tmp_path):
     torch.manual_seed(0)
-    model = training.network(task, zoom=zoom)
+    model = training.network(task, zoom=zoom, blur=blur)
     contract = export.contract_of(task, (5.0, 2.0), seed=0, commit="abc") | {
         "upright": False,
         "flips": 1,

@@ -169,6 +169,22 @@ def test_weights_see_the_ground_as_before(tmp_path, task, gsd, zoom):
     assert training.usual_zoom(task, gsd, tmp_path / "both.pt") == training.usual_zoom(task, gsd)
 
 
+def test_weights_see_as_blurred_as_before(tmp_path):
+    before = SETTINGS._replace(task="sections", gsd=0.38, blur=1.0)
+    torch.save({"average": {}, "settings": before._asdict()}, tmp_path / "sections.pt")
+    assert training.usual_blur(0.38, tmp_path / "sections.pt") == 1
+    assert training.usual_blur(0.25, tmp_path / "sections.pt") == pytest.approx(1.52)
+    old = {key: value for key, value in before._asdict().items() if key != "blur"}
+    torch.save({"average": {}, "settings": old}, tmp_path / "old.pt")
+    assert training.usual_blur(0.38, tmp_path / "old.pt") == training.usual_blur(0.38) == 0
+
+
+def test_a_blur_beyond_reason_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        training.main([f"--out={tmp_path}", "--blur=-1", "--tiles=0"])
+    assert "--blur -1" in capsys.readouterr().err
+
+
 def test_weights_that_are_no_numbers_are_refused(tmp_path):
     model = training.network()
     average = model.state_dict()
