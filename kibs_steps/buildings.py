@@ -5,7 +5,8 @@ touch exactly: their planes are fitted apart, and each outline was moved by its 
 strip of up to |k·n|·Δz (k the lean, n the edge's normal) was hidden in the image and is missing. A **building** is a connected
 group of sections that share edges, split where the step along the edge is higher than 3 m, and between footprints if given.
 
-Buildings that share edges all the same (across a high step, or a footprint's line) form a **cluster**: they share party walls.
+Buildings that share edges all the same (across a high step, or a footprint's line), or of which one reaches under the other's
+roof, form a **cluster**: they share party walls, and their solids do not stand in each other.
 
 In: all blocks' `ground.parquet`. Out: `buildings.parquet`, the same rows with `building_id` and `cluster_id`, the smallest
 `section_id` of each, and `block`: the block whose core holds the cluster's id pixel, so neither is ever cut. Blocks and
@@ -76,7 +77,7 @@ class Sections(NamedTuple):
 
 
 class Adjacent(NamedTuple):
-    """Pairs (m, 2) of sections that touch, and whether their step and overlap let them be one building (m,)."""
+    """Pairs (m, 2) of sections that touch or overlap, and whether their step there lets them be one building (m,)."""
 
     pairs: np.ndarray
     together: np.ndarray
@@ -93,10 +94,9 @@ def adjacent(found: Sections, own: np.ndarray, reach: float) -> Adjacent:
     pairs = pairs[(pairs[:, 0] < pairs[:, 1]) & own[order[pairs[:, 0]]]]
     length, step = shared_edges(flat, found.planes, pairs, found.lean)
     long = length >= SHARED
-    together = long & (step <= STEP)
+    together, touching = long & (step <= STEP), long.copy()
     rest = np.flatnonzero(~long)
-    together[rest] = _overlapping(whole, found.planes, pairs[rest])
-    touching = long | together
+    touching[rest], together[rest] = _overlapping(whole, found.planes, pairs[rest])
     return Adjacent(order[pairs[touching]], together[touching])
 
 
@@ -190,9 +190,10 @@ def _heights(planes: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return planes[:, 0] * (xy[:, 0] - planes[:, 3]) + planes[:, 1] * (xy[:, 1] - planes[:, 4]) + planes[:, 2]
 
 
-def _overlapping(outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """(m,) bool: pairs that cover each other by `OVERLAP` with a step of at most `STEP` there, as a dormer its roof."""
-    together = np.zeros(len(pairs), bool)
+def _overlapping(outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) bool: pairs that cover each other by `OVERLAP`; (m,) bool: those with a step of at most `STEP` there, as a dormer and
+    its roof."""
+    over, together = np.zeros((2, len(pairs)), bool)
     if len(pairs):
         touch = np.flatnonzero(shapely.intersects(outlines[pairs[:, 0]], outlines[pairs[:, 1]]))
         shared = shapely.intersection(outlines[pairs[touch, 0]], outlines[pairs[touch, 1]])
@@ -200,8 +201,8 @@ def _overlapping(outlines: np.ndarray, planes: np.ndarray, pairs: np.ndarray) ->
         touch = touch[large]
         centre = shapely.get_coordinates(shapely.centroid(shared[large]))
         first, second = (_heights(planes[pairs[touch, k]], centre) for k in (0, 1))
-        together[touch] = np.abs(first - second) <= STEP
-    return together
+        over[touch], together[touch] = True, np.abs(first - second) <= STEP
+    return over, together
 
 
 def standing_in(outlines: np.ndarray, footprints: np.ndarray) -> np.ndarray:

@@ -24,6 +24,8 @@ from kibs_steps.errors import KibsError
 OVERLAP = 0.3  # of the smaller of two outlines, from which on they may be one building
 NEAR = 8.0  # m, how far a building that nothing overlaps is looked for
 ALIKE = 0.6  # ratio of areas of such a pair
+WHOLE = 0.95  # ratio of areas below which one outline may be a part of the other,
+WITHIN = 0.9  # if as much of it lies within
 MOVED = 1.5  # m
 HEIGHT = 1.0  # m
 SIGMAS = 3.0
@@ -92,12 +94,18 @@ def changes(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[s
     for o, n in together:
         a, b = (shapely.get_coordinates(shapely.centroid(s[k]))[0] for s, k in zip(shapes, (o, n), strict=True))
         offset = float(np.hypot(*(b - a)))
-        small, large = sorted((shapes[0][o].area, shapes[1][n].area))
-        moved = offset if small >= ALIKE * large else 0.0  # the middle of a part is another one, though nothing moved
+        moved = 0.0 if is_part(shapes[0][o], shapes[1][n]) else offset
         rows.append(_row(compared(old[o], new[n], moved), old[o], new[n], offset))
     rows += [_row("gone", old[o], None, None) for o in sorted(set(range(len(old))) - {o for o, _ in together})]
     rows += [_row("new", None, new[n], None) for n in sorted(set(range(len(new))) - {n for _, n in together})]
     return rows
+
+
+def is_part(one: shapely.Geometry, other: shapely.Geometry) -> bool:
+    """Whether one of two outlines is the other less some of it: its middle is elsewhere, though nothing moved."""
+    small, large = sorted((one, other), key=lambda shape: shape.area)
+    lost = small.area < WHOLE * large.area and small.intersection(large).area >= WITHIN * small.area
+    return lost or small.area < ALIKE * large.area
 
 
 def _row(

@@ -179,9 +179,8 @@ def together(
         place = {int(row): k for k, row in enumerate(rows)}
         own = [Face(place[f.section], f.rings) for f in faces if f.section in place]
         if not own:
-            found.append(
-                Built(b, mine, build(mine, dtm, lod_label, fit) if len(names) > 1 else _nothing(mine, dtm, []))
-            )
+            lost = ["nothing of it is left beside and under the roofs of the buildings it touches"]
+            found.append(Built(b, mine, _nothing(mine, dtm, lost if len(names) > 1 else [])))
             continue
         found.append(Built(b, mine, _climb(own, mine, dtm, lod_label)))
     return with_party_walls(found)

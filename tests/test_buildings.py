@@ -20,12 +20,12 @@ def level(z):
     return (0.0, 0.0, z, 0.0, 0.0)
 
 
-def grouped(shapes, planes=None, lean=(0.0, 0.0), footprint=None, ids=None):
-    """Building ids of sections 1, 2, 3 …"""
+def grouped(shapes, planes=None, lean=(0.0, 0.0), footprint=None, ids=None, clusters=False):
+    """Building ids (cluster ids) of sections 1, 2, 3 …"""
     n = len(shapes)
     ids = np.arange(1, n + 1) if ids is None else np.asarray(ids)
     planes = np.array(planes or [LEVEL] * n)
-    return buildings.buildings(ids, np.array(shapes, object), planes, lean, footprint)[0].tolist()
+    return buildings.buildings(ids, np.array(shapes, object), planes, lean, footprint)[int(clusters)].tolist()
 
 
 def box(x0, y0, x1, y1):
@@ -79,6 +79,15 @@ def test_the_step_counts_along_the_edge_not_at_the_middle():
 def test_a_dormer_on_a_roof_belongs_to_it():
     assert grouped([box(0, 0, 10, 10), box(4, 4, 6, 6)], [level(6.0), level(7.0)]) == [1, 1]
     assert grouped([box(0, 0, 10, 10), box(4, 4, 6, 6)], [level(6.0), level(12.0)]) == [1, 2]
+
+
+def test_what_reaches_under_a_much_higher_roof_is_another_building_of_its_cluster():
+    """So that their solids are tiled together and do not stand in each other."""
+    shapes, planes = [box(0, 0, 10, 10), box(4, 4, 6, 6), box(8, 30, 9, 31)], [level(12.0), level(6.0), level(6.0)]
+    assert grouped(shapes, planes) == [1, 2, 3]
+    assert grouped(shapes, planes, clusters=True) == [1, 1, 3]
+    shapes[1] = box(9.8, 9.8, 12, 12)  # over each other by 0.04 m² only
+    assert grouped(shapes, planes, clusters=True) == [1, 2, 3]
 
 
 def test_a_section_in_a_hole_belongs_to_the_ring_round_it():

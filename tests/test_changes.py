@@ -74,6 +74,17 @@ def test_a_building_grouped_otherwise_has_not_moved(tmp_path):
     assert sorted(r["change"] for r in changed) == ["new", "new", "new", "same"]
 
 
+@pytest.mark.parametrize(
+    ("part", "change"), [((0, 0, 16), "same"), ((4, 2, 16), "same"), ((8, 8, 16), "moved"), ((3, 0, 20), "moved")]
+)
+def test_a_building_that_lost_a_part_has_not_moved(tmp_path, part, change):
+    """Nor has one that gained it; but one as large, or that reaches beyond where it was, has."""
+    whole, less = result(tmp_path / "a", [(1, 0, 0, 20, 6)]), result(tmp_path / "b", [(2, *part, 6)])
+    for folders in ((whole, less), (less, whole)):
+        (row,) = changes.changes(*(changes.read(folder)[0] for folder in folders))
+        assert row["change"] == change
+
+
 def test_the_other_way_round(tmp_path):
     old, new = result(tmp_path / "old", OLD), result(tmp_path / "new", NEW)
     rows = changes.changes(changes.read(new)[0], changes.read(old)[0])

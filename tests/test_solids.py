@@ -349,3 +349,26 @@ def test_a_gap_between_drawn_sections_is_closed_only_where_a_step_hid_it(seen, a
     footprint = sum(shapely.area(shapely.get_parts(one.base)))
     assert footprint == pytest.approx(200.0 + (10 * apart if closed else 0.0), abs=0.1)
     assert shells_are_valid(one)
+
+
+def under(low):
+    """A roof 9 m high over 10 x 10 m, and a building 3 m high whose outline is `low`."""
+    planes = np.array([[0.0, 0.0, 9.0], [0.0, 0.0, 3.0]])
+    outlines = [shapely.box(0, 0, 10, 10), shapely.box(*low)]
+    return solids.Sections(np.array([1, 2]), outlines, planes, ["ok", "ok"], np.full(2, 0.1), (0, 0))
+
+
+def test_a_low_building_ends_where_another_ones_roof_begins():
+    found = solids.together(under((5, 2, 14, 8)), np.array([1, 2]), FLAT)
+    assert [(built.building, built.solid.lod) for built in found] == [(1, "2.0"), (2, "2.0")]
+    bases = [shapely.union_all(shapely.get_parts(built.solid.base)) for built in found]
+    assert bases[0].intersection(bases[1]).area < 1e-6
+    assert [base.area for base in bases] == pytest.approx([100.0, 24.0], rel=1e-3)
+
+
+def test_a_building_wholly_under_another_ones_roof_is_told_not_built():
+    high, low = solids.together(under((4, 4, 6, 6)), np.array([1, 2]), FLAT)
+    assert (high.solid.lod, high.solid.reason) == ("2.0", "")
+    assert (low.solid.lod, low.solid.shells) == ("0", [])
+    assert "under the roofs of the buildings it touches" in low.solid.reason
+    assert low.solid.base.area == pytest.approx(4.0)
