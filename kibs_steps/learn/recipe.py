@@ -28,6 +28,7 @@ DEFAULTS = {
     "minutes": 90,
     "steps": None,
     "gsd": None,
+    "blur": None,
     "seed": 0,
     "tiles": 4000,
     "cities": [],
@@ -131,6 +132,8 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
     teachers = [train["init"], *(item.get("guess") for item in train["own"] if not isinstance(item, str))]
     if any(_same_set(teacher, str(train["name"]), base) for teacher in teachers if teacher):
         raise BadConfig(f"train: the set {train['name']} cannot be made from itself: give what is trained another name")
+    if train["blur"] and train["family"] != "dense":
+        raise BadConfig("train.blur: networks of family maskrcnn see the image as it is: leave it out")
     if not own and not train["data"] and not train["tiles"]:
         raise BadConfig("train: nothing to learn from: give own, data or tiles")
     cities = list(map(str, train["cities"]))
@@ -139,7 +142,7 @@ def recipe(config: dict[str, Any], base: Path, told: Collection[str] = ()) -> Re
 
     options = [f"--{key}={train[key]}" for key in ("minutes", "seed", "tiles", "validation", "patience", "device")]
     options += [f"--family={train['family']}"]
-    options += [f"--{key}={train[key]}" for key in ("data", "steps", "gsd") if train[key] is not None]
+    options += [f"--{key}={train[key]}" for key in ("data", "steps", "gsd", "blur") if train[key] is not None]
     options += ["--free"] if train["free"] else []
     for key in ("cities", "leave_out"):
         if train[key]:

@@ -320,6 +320,8 @@ def main(argv: list[str] | None = None) -> None:
     cv2.setNumThreads(1)  # the loader's processes are forked: they would wait for threads that only their parent has
     out = Path(args.out)
     if args.family == "maskrcnn":
+        if args.blur:
+            parser.error("--blur is for dense networks")
         task = args.task or "sections"
         settings = Settings(
             args.seed, maskrcnn.TILE, args.batch or 2, args.rate or 2e-4, family="maskrcnn", task=task, gsd=args.gsd

@@ -59,6 +59,15 @@ def test_another_gsd_is_that_of_the_network_and_of_own_tiles(tmp_path):
     assert not [o for o in recipe.own_options(found.own["town"], "blocks", 0) if "gsd" in o]
 
 
+def test_a_blur_is_that_of_all_networks(tmp_path):
+    training = recipe.recipe({"train": {"blur": 1.0, "networks": "separate"}}, tmp_path).training
+    assert all("--blur=1.0" in options for options in training.values())
+    assert (
+        "--blur=0" in recipe.recipe({"train": {"blur": 0}}, tmp_path).training["both"]
+    )  # sharper than those of `init`
+    assert not any("blur" in option for option in recipe.recipe({}, tmp_path).training["both"])
+
+
 def test_joins_are_learned_for_networks_that_find_basins(tmp_path):
     assert recipe.recipe({}, tmp_path).joins == {"both": ["--scenes=120"], "sections": ["--scenes=120"], "corners": []}
     for train in ({"family": "maskrcnn", "joins": 9}, {"joins": 0}):
@@ -220,6 +229,7 @@ def test_angles_may_come_from_metadata(tmp_path):
         ({"scene": "parts"}, "name a scene of one view"),
         ({"init": "nothing"}, r"nothing is no file"),
         ({"tiles": 0}, "nothing to learn from"),
+        ({"blur": 1.0, "family": "maskrcnn"}, "see the image as it is"),
         ({"cities": ["none.json"]}, "none.json is not there"),
         ({"name": "a", "init": "a"}, "set a cannot be made from itself"),
         ({"name": "a", "init": "models/a"}, "set a cannot be made from itself"),
