@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from kibs_steps.simulate import roofs
-from kibs_steps.simulate.pieces import pick
+from kibs_steps.simulate.pieces import Paint, Place, pick
 from kibs_steps.simulate.site import Site
 
 
@@ -183,11 +183,39 @@ def _roundabout(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:
     for turn in range(4):
         island = site.place(cs, ct, turn * np.pi / 2)
         site.paint(island.put(np.array([[outer, -0.3], [outer + 9, -0.2], [outer + 9, 0.2], [outer, 1.6]])), "pavement")
+    _islands(site, outer, place, np.arcsin(min((arm + 1) / outer, 0.7)))
     for _ in range(int(rng.integers(0, 8))):
         a = rng.uniform(0, 2 * np.pi)
         r = outer - width / 2
         spot = site.place(cs + r * np.cos(a), ct + r * np.sin(a), a + np.pi / 2)
         site.car(spot.x, spot.y, spot.angle)
+
+
+def _islands(site: Site, outer: float, place: Place, half: float) -> None:
+    """Paved or planted islands about a roundabout of radius `outer` (m): what parts the lanes of its arms, and crescents between
+    arms, which are `half` (rad) wide to either side. They have straight and round kerbs, as roofs have, and no height."""
+    rng = site.rng.spawn(1)[0]  # its own: the city beside is the same with and without them
+    material = site.kit.draw(rng, pick(rng, ["pavement", "pavement", "track", "gravel", "lawn"]))
+    beside, deep = rng.uniform(0.3, 1.5), rng.uniform(1.0, 4.0)
+    for turn in range(4):
+        at = place._replace(angle=place.angle + turn * np.pi / 2)
+        bright = np.exp(rng.normal(0, 0.2))
+        wide, long, tip = rng.uniform(0.3, 3.0), rng.uniform(5, 22), rng.uniform(0.1, 0.8)
+        near, far = outer + rng.uniform(0, 2), outer + long
+        pieces = [(0.0, 1.0)]
+        if rng.random() < 0.5:  # where people cross
+            middle, path = rng.uniform(0.35, 0.65), min(rng.uniform(0.6, 1.5) / (far - near), 0.2)
+            pieces = [(0.0, middle - path), (middle + path, 1.0)]
+        rings = []
+        for ends in pieces:
+            x, y = near + np.array(ends) * (far - near), wide * (1 - (1 - tip) * np.array(ends))
+            rings.append(np.array([[x[0], -y[0]], [x[1], -y[1]], [x[1], y[1]], [x[0], y[0]]]))
+        if rng.random() < 0.6:
+            along = np.linspace(half + rng.uniform(0, 0.2), np.pi / 2 - half - rng.uniform(0, 0.2), 9)
+            rim = outer + beside + deep * np.sin(np.linspace(0, np.pi, 9)) ** 0.5
+            towards = np.column_stack([np.cos(along), np.sin(along)])
+            rings.append(np.concatenate([(outer + beside) * towards, (rim[:, None] * towards)[-2:0:-1]]))
+        site.paints += [Paint(at.put(ring), material, (bright, bright, bright), at.angle) for ring in rings]
 
 
 def street(site: Site, s0: float, t0: float, s1: float, t1: float) -> None:

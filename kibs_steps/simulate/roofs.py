@@ -307,6 +307,23 @@ def prism(ring: np.ndarray, low: float, high: float) -> tuple[np.ndarray, list[n
     return top, [np.array([foot[i], foot[j], top[j], top[i]]) for i, j in enumerate(after)]
 
 
+def dome(rim: np.ndarray, rise: float, rings: int = 4) -> list[np.ndarray]:
+    """A round lid over a level, counter-clockwise rim (n, 3): a spherical cap `rise` m high in `rings` rings of faces, the last
+    of triangles; a cone for one."""
+    middle = rim.mean(axis=0)
+    radius = np.hypot(*(rim[0] - middle)[:2])
+    sphere = (radius**2 + rise**2) / (2 * rise)
+    lids, low = [], rim
+    for i in range(1, rings + 1):
+        share = 1 - i / rings
+        up = np.sqrt(sphere**2 - (share * radius) ** 2) - (sphere - rise)
+        high = middle + (rim - middle) * [share, share, 0.0] + [0.0, 0.0, up]
+        after = zip(low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high, strict=True)
+        lids += [np.array([a, b, d] if i == rings else [a, b, c, d]) for a, b, c, d in after]
+        low = high
+    return lids
+
+
 def slab(axes: Frame, u0: float, v0: float, u1: float, v1: float, lift: float) -> np.ndarray:
     """A thin rectangle parallel to the roof (skylight, solar panel)."""
     return np.array(

@@ -222,7 +222,7 @@ class Site:
         self.faces += [Face(place.put(r), (), kind, 0, 0, material, shade) for r in (top, *sides)]
 
     def tank(self, place: Place, radius: float, height: float) -> None:
-        """A round tank or silo, flat, conical or with a sunken floating roof: looks like a roof, is none."""
+        """A round tank or silo, domed, conical, flat or with a sunken floating roof: looks like a roof, is none."""
         rng = self.rng
         if self.built(place.x, place.y):
             return
@@ -232,9 +232,10 @@ class Site:
         material, shade = self.kit.draw(rng, "tank"), self.tint(0.1)
         top, sides = roofs.prism(ring, 0.0, height)
         kind = rng.random()
-        if kind < 0.45:
-            apex = np.array([0.0, 0.0, height + radius * rng.uniform(0.08, 0.3)])
-            lids = [np.array([a, b, apex]) for a, b in zip(top, np.roll(top, -1, axis=0), strict=True)]
+        if kind < 0.25:
+            lids = roofs.dome(top, radius * rng.uniform(0.2, 0.8))
+        elif kind < 0.45:
+            lids = roofs.dome(top, radius * rng.uniform(0.08, 0.3), rings=1)
         elif kind < 0.75:
             lids = [top - np.array([0.0, 0.0, min(0.6 * height, rng.uniform(0.5, 3.0))])]
         else:

@@ -6,7 +6,7 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
 
-from kibs_steps.simulate.roofs import KINDS, Wing, dormer, frame_of, rectangle, sections, walls, wing
+from kibs_steps.simulate.roofs import KINDS, Wing, dome, dormer, frame_of, rectangle, sections, walls, wing
 
 
 def plan(ring):
@@ -117,3 +117,22 @@ def test_a_wing_may_be_any_convex_plan():
     w = Wing([(0, 0), (10, 1), (9, 7), (1, 6)], ((0.0, 0.5, 3.0), (0.0, -0.5, 6.0)))
     assert sum(plan(r).area for r in sections([w])) == pytest.approx(Polygon(w.footprint).area)
     assert rectangle(0, 0, 2, 1) == [(0, 0), (2, 0), (2, 1), (0, 1)]
+
+
+@pytest.mark.parametrize(("rise", "rings"), [(1.5, 1), (1.5, 4), (5.0, 6)])
+def test_a_dome_is_a_cap_of_a_sphere(rise, rings):
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = np.column_stack([3 + 6 * np.cos(angle), 6 * np.sin(angle) - 1, np.full(24, 8.0)])
+    lids = dome(rim, rise, rings)
+    shapes = [plan(r) for r in lids]
+    assert all(s.is_valid and s.exterior.is_ccw for s in shapes)
+    assert sum(s.area for s in shapes) == pytest.approx(plan(rim).area)
+    assert unary_union(shapes).symmetric_difference(plan(rim)).area < 1e-6
+    points = np.concatenate(lids)
+    radius = (6**2 + rise**2) / (2 * rise)
+    middle = [3, -1, 8 + rise - radius]
+    assert np.linalg.norm(points - middle, axis=1) == pytest.approx(np.full(len(points), radius))
+    assert points[:, 2].max() == pytest.approx(8 + rise)
+    for ring in lids:  # renderers draw planes
+        normal = np.cross(ring[1] - ring[0], ring[2] - ring[0])
+        assert np.abs((ring - ring[0]) @ normal).max() < 1e-9 * max(1, np.abs(normal).max())

@@ -4,12 +4,13 @@ import cities
 import cv2
 import numpy as np
 import pytest
+import shapely
 
 from kibs_steps import georeference
 from kibs_steps import terrain as dtm
 from kibs_steps import view as geometry
 from kibs_steps.grid import Grid
-from kibs_steps.simulate import scene, works
+from kibs_steps.simulate import outdoors, scene, works
 from kibs_steps.simulate.camera import CLEAR, Camera
 from kibs_steps.simulate.pieces import CLUTTER, OBJECT, ROOF, WALL, City, Face, Paint, Place
 from kibs_steps.simulate.rendering import ON_ROOF, OTHER
@@ -195,6 +196,20 @@ def test_tanks_greenhouses_and_ships_have_no_sections():
     assert not picture.sections
     assert not (picture.surface == ON_ROOF).any()
     assert (picture.surface == OTHER).mean() > 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_roundabouts_with_their_islands_are_ground(seed):
+    kit = palette(np.random.default_rng(seed))
+    site = Site(np.random.default_rng(seed), dtm.flat(0.0), kit, (0, 0, 120, 120), 0.0)
+    site.turn = 0.0
+    outdoors._roundabout(site, -50, -50, 50, 50)
+    rings = [shapely.Polygon(paint.ring) for paint in site.paints]
+    assert all(ring.is_valid for ring in rings)
+    assert len(rings) > 9 + 4  # carriageways and the round in the middle, and an island in each arm at least
+    picture = shoot(site.faces, grid=Grid("", 0.0, 120.0, 0.6, 200, 200), materials=kit.materials)
+    assert not picture.section.any()
+    assert not (picture.surface == ON_ROOF).any()
 
 
 def test_backgrounds_are_used_where_usable():
